@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every parameter of the method, once: default, description, unit and bounds.
+
+Nodes declare their ROS parameters by iterating over these fields (`limbloc_ros.ros.parameters`), the offline
+run reads the same classes from YAML, and `docs/parameters.md` is generated from them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from limbloc_ros.core.errors import ConfigError
+
+T = TypeVar("T")
+
+
+def setting(
+    default: Any,
+    description: str,
+    *,
+    unit: str = "",
+    low: float = -math.inf,
+    high: float = math.inf,
+    choices: tuple[str, ...] = (),
+    live: bool = False,
+) -> Any:
+    """A dataclass field that carries what a person needs to set it.
+
+    `live` says that a running node may change it (`ros2 param set`); all others are read-only after start.
+    """
+    info = {"description": description, "unit": unit, "low": low, "high": high, "choices": choices, "live": live}
+    return dataclasses.field(default=default, metadata=info)
+
+
+@dataclass(frozen=True)
+class BackgroundConfig:
+    """Running Gaussian average segmentation (paper section 1, after Wren et al. 1997)."""
+
+    learning_frames: int = setting(15, "person-free frames that make the first background", low=1, high=10_000)
+    learning_rate: float = setting(0.01, "weight of a new background pixel", low=0.0, high=1.0, live=True)
+    threshold_sigmas: float = setting(
+        4.0, "a pixel further than this from its mean is foreground", unit="sigma", low=0.5, high=50.0, live=True
+    )
+    sigma_floor: float = setting(
+        4.0, "smallest standard deviation of a channel", unit="grey levels", low=0.1, high=64.0, live=True
+    )
+    shadow_darkest: float = setting(
+        0.5, "a pixel darker than this fraction of its background is no shadow", low=0.0, high=1.0, live=True
+    )
+    shadow_chroma: float = setting(
+        0.06, "largest chromaticity change that still counts as shadow", low=0.0, high=1.0, live=True
+    )
+    open_px: int = setting(1, "radius of the morphological opening (removes specks)", unit="px", low=0, high=20, live=True)
+    close_px: int = setting(3, "radius of the morphological closing (fills cracks)", unit="px", low=0, high=50, live=True)
+    min_blob_px: int = setting(150, "smaller foreground blobs are dropped", unit="px", low=0, high=1_000_000, live=True)
+    max_hole_px: int = setting(200, "smaller holes in the foreground are filled", unit="px", low=0, high=1_000_000, live=True)
+
+
+@dataclass(frozen=True)
+class HullConfig:
+    """The visual hull as a signed distance field (paper section 1)."""
+
+    voxel_m: float = setting(0.02, "edge length of a voxel", unit="m", low=0.005, high=0.10)
+    band_m: float = setting(
+        0.06, "signed distances outside the hull are kept up to this, as a thin shell", unit="m", low=0.01, high=0.5
+    )
+    min_cameras: int = setting(2, "fewer live masks than this give no hull", low=1, high=64, live=True)
+    max_misses: int = setting(
+        -1, "cameras that may call a voxel background while it stays (-1: chosen from the masks)", low=-1, high=16, live=True
+    )
+    min_voxels: int = setting(500, "smaller hulls are no person", unit="voxels", low=1, high=10_000_000, live=True)
+
+
+@dataclass(frozen=True)
+class SyncConfig:
+    """How masks of several cameras become one set by acquisition stamp."""
+
+    slop_s: float = setting(0.02, "largest stamp difference within a set", unit="s", low=0.0, high=1.0, live=True)
+    queue: int = setting(10, "sets that may wait for late cameras", unit="sets", low=1, high=1000)
+    timeout_s: float = setting(0.15, "an incomplete set is used or dropped after this", unit="s", low=0.0, high=10.0, live=True)
+
+
+@dataclass(frozen=True)
+class FitConfig:
+    """How the figure is fitted to the hull (paper sections 2.1 to 2.5)."""
+
+    engine: str = setting("robust", "which fitting chain runs", choices=("robust", "paper"))
+    temporal: bool = setting(False, "start from the previous frame; falls back by itself", live=True)
+    seed: int = setting(0, "seed of every random choice: the same input gives the same result", low=0, high=2**31 - 1)
+
+
+@dataclass(frozen=True)
+class PipelineConfig:
+    """Everything between masks and joint angles."""
+
+    hull: HullConfig = dataclasses.field(default_factory=HullConfig)
+    fit: FitConfig = dataclasses.field(default_factory=FitConfig)
+
+
+def validated(config: T) -> T:
+    """Return `config` unchanged, or raise ConfigError naming the first field that is out of its bounds."""
+    for field in dataclasses.fields(config):  # type: ignore[arg-type]
+        value, info = getattr(config, field.name), field.metadata
+        if dataclasses.is_dataclass(value):
+            validated(value)
+            continue
+        if info.get("choices") and value not in info["choices"]:
+            raise ConfigError(f"{field.name}: expected one of {', '.join(info['choices'])}, got {value!r}")
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            continue
+        if not info.get("low", -math.inf) <= value <= info.get("high", math.inf):
+            raise ConfigError(
+                f"{field.name}: expected {info['low']} to {info['high']} {info['unit']}".rstrip() + f", got {value}"
+            )
+    return config
+
+
+def from_mapping(kind: type[T], values: Mapping[str, Any]) -> T:
+    """Build the config dataclass `kind` from plain values, e.g. a YAML section.
+
+    Raises:
+        ConfigError: an unknown name (the known ones are listed), a wrong type, or a value out of bounds.
+    """
+    fields = {f.name: f for f in dataclasses.fields(kind)}  # type: ignore[arg-type]
+    kwargs: dict[str, Any] = {}
+    for name, value in values.items():
+        if name not in fields:
+            raise ConfigError(f"{kind.__name__} has no parameter {name!r}; it has {', '.join(sorted(fields))}")
+        field = fields[name]
+        default = field.default
+        if default is dataclasses.MISSING:
+            default = field.default_factory()  # type: ignore[misc]
+        if dataclasses.is_dataclass(default):
+            if not isinstance(value, Mapping):
+                raise ConfigError(f"{name}: expected a section of parameters, got {value!r}")
+            kwargs[name] = from_mapping(type(default), value)  # type: ignore[arg-type]
+            continue
+        if isinstance(default, float) and isinstance(value, int) and not isinstance(value, bool):
+            value = float(value)
+        if type(value) is not type(default):
+            raise ConfigError(f"{name}: expected {type(default).__name__} like {default!r}, got {value!r}")
+        kwargs[name] = value
+    return validated(kind(**kwargs))
