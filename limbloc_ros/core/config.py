@@ -82,6 +82,9 @@ class SyncConfig:
     slop_s: float = setting(0.02, "largest stamp difference within a set", unit="s", low=0.0, high=1.0, live=True)
     queue: int = setting(10, "sets that may wait for late cameras", unit="sets", low=1, high=1000)
     timeout_s: float = setting(0.15, "an incomplete set is used or dropped after this", unit="s", low=0.0, high=10.0, live=True)
+    silent_sets: int = setting(
+        5, "a camera missing in this many sets running is not waited for until it is back (0: always wait)", low=0, high=1000
+    )
 
 
 @dataclass(frozen=True)
