@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every topic and service name and every QoS profile, once.
+
+Names are relative, so that a namespace moves the whole graph; only `/diagnostics`, `/tf` and `/clock` are absolute,
+as everywhere in ROS.
+
+Each carved set gives exactly one message on `hull` (an empty cloud when nobody is there), and each hull exactly one on
+`joints` (an empty array when there is no posture to act on): whoever waits for a result always gets one.
+
+Images are subscribed best effort, which every camera driver offers; everything we publish is reliable, because a
+reliable publisher also serves best-effort subscribers, RViz asks for reliable, and best-effort messages of some 100 KB
+are lost by an untuned Fast DDS (docs/deployment.md). All queues are short and keep the newest: under load old data is
+dropped instead of growing late.
+"""
+
+from __future__ import annotations
+
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+
+# --- per camera ---
+
+
+def image(camera: str) -> str:
+    """sensor_msgs/Image of a camera."""
+    return f"{camera}/image_raw"
+
+
+def image_compressed(camera: str) -> str:
+    """sensor_msgs/CompressedImage (JPEG or PNG) of a camera."""
+    return f"{camera}/image_raw/compressed"
+
+
+def camera_info(camera: str) -> str:
+    """sensor_msgs/CameraInfo of a camera."""
+    return f"{camera}/camera_info"
+
+
+def mask(camera: str) -> str:
+    """sensor_msgs/Image, mono8, 255 = foreground."""
+    return f"{camera}/mask"
+
+
+def mask_compressed(camera: str) -> str:
+    """sensor_msgs/CompressedImage, bilevel PNG of the mask (about 1 KB)."""
+    return f"{camera}/mask/compressed"
+
+
+def optical_frame(camera: str) -> str:
+    """TF frame of a camera's optical axes (REP-103)."""
+    return f"{camera}_optical"
+
+
+# --- results ---
+
+HULL = "hull"  # sensor_msgs/PointCloud2, see cloud_messages.hull_to_cloud
+SURFACE = "surface"  # sensor_msgs/PointCloud2 with normals, curvature and geodesic distance, on demand
+JOINTS = "joints"  # geometry_msgs/PoseArray, 25 joints in the order of core.pose.JOINT_NAMES
+TRUE_JOINTS = "true_joints"  # the same of the simulated person
+MARKERS = "markers"  # visualization_msgs/MarkerArray, stick figure and flesh figure
+JOINT_ANGLES = "joint_angles"  # sensor_msgs/JointState, the full native set
+DIAGNOSTICS = "/diagnostics"  # diagnostic_msgs/DiagnosticArray
+
+
+def body_joint_states(body_id: str) -> str:
+    """sensor_msgs/JointState of a person with the ROS4HRI joint names (REP-155)."""
+    return f"humans/bodies/{body_id}/joint_states"
+
+
+def body_urdf(body_id: str) -> str:
+    """std_msgs/String, latched: the URDF with the fitted lengths."""
+    return f"humans/bodies/{body_id}/urdf"
+
+
+def body_frame(body_id: str) -> str:
+    """TF frame of a person: mid-hips, x forward, z to the head."""
+    return f"body_{body_id}"
+
+
+# --- services, below the node's own name ---
+
+RECAPTURE_BACKGROUND = "~/recapture_background"  # std_srvs/Trigger
+FREEZE_BACKGROUND = "~/freeze_background"  # std_srvs/SetBool
+
+# --- quality of service ---
+
+
+def _reliable(depth: int) -> QoSProfile:
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=depth,
+        reliability=ReliabilityPolicy.RELIABLE,
+        durability=DurabilityPolicy.VOLATILE,
+    )
+
+
+def image_subscription(reliability: str) -> QoSProfile:
+    """`best_effort` (works with every camera) or `reliable`."""
+    qos = _reliable(5)
+    if reliability == "best_effort":
+        qos.reliability = ReliabilityPolicy.BEST_EFFORT
+    return qos
+
+
+#: Everything that is published per frame.
+STREAM_QOS = _reliable(5)
+#: Masks on their way into the synchroniser, which does its own queueing.
+MASK_QOS = _reliable(10)
+#: Input of the slowest stage: only the newest hull counts.
+NEWEST_QOS = _reliable(1)
+DIAGNOSTICS_QOS = _reliable(10)
+#: Kept for late joiners (the URDF).
+LATCHED_QOS = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST,
+    depth=1,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
