@@ -1,0 +1,304 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The rig file: the calibrated cameras of a room and the box of space that is carved.
+
+Our own format is YAML (see `docs/rig_file.md` for a commented example)::
+
+    version: 1
+    units: m                       # nothing else is accepted: a rig in millimetres is a common accident
+    volume:                        # optional; without it the box is derived from what the cameras see
+      min: [-1.5, -1.5, 0.0]       # world axes: z up, the floor at z = 0
+      max: [1.5, 1.5, 2.5]
+    cameras:
+      - name: cam0                 # also the prefix of its topics: cam0/image_raw
+        width: 640
+        height: 480
+        K: [[518.4, 0, 319.5], [0, 518.4, 239.5], [0, 0, 1]]     # px, pixel centres at integers
+        distortion_model: radtan   # none, radtan (plumb_bob), rational (rational_polynomial), fisheye (equidistant)
+        distortion: [0.1, -0.05, 0, 0, 0]                        # OpenCV's order
+        T_world_camera:            # pose of the optical frame (x right, y down, z forward); or a 4x4 matrix
+          translation: [2.0, 0.0, 1.5]
+          quaternion: [0.5, 0.5, -0.5, -0.5]                     # x y z w
+
+A benchmark's `calib.json` (`R`, `t` with x_cam = R X + t, and `dist`) is read by the same function.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from limbloc_ros.core.camera import DISTORTION_COEFFICIENTS, Camera, Rig
+from limbloc_ros.core.errors import RigError
+from limbloc_ros.rig.volume import derive_volume
+
+Array = NDArray[np.float64]
+
+VERSION = 1
+
+#: Other people's names of the distortion models.
+MODEL_ALIASES = {
+    "plumb_bob": "radtan",
+    "rational_polynomial": "rational",
+    "equidistant": "fisheye",
+    "pinhole": "none",
+    "": "none",
+}
+
+_RIG_KEYS = ("version", "units", "volume", "cameras")
+_CAMERA_KEYS = ("name", "width", "height", "K", "distortion_model", "distortion", "T_world_camera")
+
+
+def load_rig(path: str | Path) -> Rig:
+    """Read a rig file: our YAML, or a benchmark's `calib.json`.
+
+    Raises:
+        RigError: the file is missing or unreadable, its syntax is wrong (with the line), or a key is missing, unknown
+            or of the wrong kind (which key, what was expected, what came).
+    """
+    path = Path(path)
+    if path.is_dir():
+        raise RigError(f"rig file {path}: expected a file, this is a folder; name the .yaml or calib.json in it")
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise RigError(f"rig file {path} does not exist; give the path of a rig YAML or a calib.json") from None
+    except UnicodeDecodeError as error:
+        raise RigError(f"rig file {path}: expected UTF-8 text, got other bytes at position {error.start}") from None
+    except OSError as error:
+        raise RigError(f"rig file {path} cannot be read: {error.strerror}") from None
+    return rig_from_mapping(_parse(text, path), str(path))
+
+
+def _parse(text: str, path: Path) -> Any:
+    """Text -> plain values; YAML, or JSON by its file name (YAML refuses tabs, JSON reads faster)."""
+    if path.suffix.lower() == ".json":
+        try:
+            return json.loads(text)
+        except json.JSONDecodeError as error:
+            raise RigError(f"rig file {path}, line {error.lineno}: not valid JSON: {error.msg}") from None
+    try:
+        return yaml.safe_load(text)
+    except yaml.MarkedYAMLError as error:
+        line = f", line {error.problem_mark.line + 1}" if error.problem_mark else ""
+        raise RigError(f"rig file {path}{line}: not valid YAML: {error.problem or error.context}") from None
+    except yaml.YAMLError as error:
+        raise RigError(f"rig file {path}: not valid YAML: {error}") from None
+
+
+def rig_from_mapping(data: Any, source: str = "rig") -> Rig:
+    """Build the rig from the plain values of a rig file.
+
+    Args:
+        data: what YAML or JSON made of the file.
+        source: how messages call the file.
+
+    Raises:
+        RigError: which key, what was expected, what came.
+    """
+    if not isinstance(data, Mapping):
+        raise RigError(f"{source}: expected keys {', '.join(_RIG_KEYS)}, got {_kind(data)}")
+    entries = data.get("cameras")
+    if not isinstance(entries, Sequence) or isinstance(entries, str) or not entries:
+        raise RigError(f"{source}: key cameras: expected a list of at least one camera, got {_kind(entries)}")
+    where = [f"{source}: cameras[{i}]" for i in range(len(entries))]
+    for entry, at in zip(entries, where, strict=True):
+        if not isinstance(entry, Mapping):
+            raise RigError(f"{at}: expected a camera with name, width, height, K, T_world_camera, got {_kind(entry)}")
+    benchmark = all("R" in entry and "t" in entry and "T_world_camera" not in entry for entry in entries)
+    if not benchmark:
+        _known_keys(data, _RIG_KEYS, source)
+        version = data.get("version")
+        if version != VERSION or isinstance(version, bool):
+            raise RigError(f"{source}: key version: expected {VERSION}, got {_kind(version)}")
+        if data.get("units", "m") != "m":
+            raise RigError(
+                f"{source}: key units: expected m (metres), got {data['units']!r}; convert the file to metres"
+            )
+    read = _benchmark_camera if benchmark else _our_camera
+    try:
+        cameras = tuple(read(entry, at) for entry, at in zip(entries, where, strict=True))
+        low, high = _volume(data["volume"], source) if "volume" in data else derive_volume(cameras)
+        return Rig(cameras, low, high)
+    except RigError as error:
+        message = str(error)
+        raise RigError(message if message.startswith(source) else f"{source}: {message}") from None
+
+
+def save_rig(rig: Rig, path: str | Path) -> None:
+    """Write `rig` as our YAML; `load_rig` gives back the same numbers, bit for bit.
+
+    Raises:
+        RigError: the file cannot be written.
+    """
+    lines = [
+        "# Cameras of a room for limbloc_ros. World: z up, floor at z = 0, metres.",
+        "# T_world_camera: pose of the optical frame (x right, y down, z forward). Pixel centres at integers.",
+        f"version: {VERSION}",
+        "units: m",
+        f"volume: {{min: {_row(rig.volume_min)}, max: {_row(rig.volume_max)}}}",
+        "cameras:",
+    ]
+    for camera in rig.cameras:
+        lines += [
+            f"  - name: {json.dumps(camera.name)}",
+            f"    width: {camera.width}",
+            f"    height: {camera.height}",
+            "    K:",
+            *(f"      - {_row(row)}" for row in camera.K),
+            f"    distortion_model: {camera.distortion_model}",
+            f"    distortion: {_row(camera.distortion)}",
+            "    T_world_camera:",
+            *(f"      - {_row(row)}" for row in camera.T_world_camera),
+        ]
+    try:
+        Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise RigError(f"rig file {path} cannot be written: {error.strerror}") from None
+
+
+def _our_camera(entry: Mapping[str, Any], at: str) -> Camera:
+    name = _name(entry, at)
+    at = f"{at} ({name})"
+    _known_keys(entry, _CAMERA_KEYS, at)
+    coefficients = _numbers(entry.get("distortion", []), None, f"{at}: key distortion")
+    model = entry.get("distortion_model", "radtan" if coefficients.size else "none")
+    if not isinstance(model, str) or MODEL_ALIASES.get(model, model) not in DISTORTION_COEFFICIENTS:
+        names = ", ".join([*DISTORTION_COEFFICIENTS, *(alias for alias in MODEL_ALIASES if alias)])
+        raise RigError(f"{at}: key distortion_model: expected one of {names}, got {_kind(model)}")
+    return Camera(
+        name,
+        _pixels(entry, "width", at),
+        _pixels(entry, "height", at),
+        _intrinsics(entry, at),
+        _camera_pose(_required(entry, "T_world_camera", at), at),
+        coefficients,
+        MODEL_ALIASES.get(model, model),
+    )
+
+
+def _benchmark_camera(entry: Mapping[str, Any], at: str) -> Camera:
+    name = _name(entry, at)
+    at = f"{at} ({name})"
+    R = _numbers(entry["R"], (3, 3), f"{at}: key R")
+    t = _numbers(entry["t"], (3,), f"{at}: key t")
+    dist = _numbers(entry.get("dist", []), None, f"{at}: key dist")
+    T = np.eye(4)
+    T[:3, :3] = R.T
+    T[:3, 3] = -R.T @ t
+    model = "none" if not dist.any() else "radtan" if dist.size <= 5 else "rational"
+    return Camera(
+        name,
+        _pixels(entry, "width", at),
+        _pixels(entry, "height", at),
+        _intrinsics(entry, at),
+        T,
+        np.zeros(0) if model == "none" else dist,
+        model,
+    )
+
+
+def _name(entry: Mapping[str, Any], at: str) -> str:
+    name = _required(entry, "name", at)
+    if not isinstance(name, str) or not name:
+        raise RigError(f"{at}: key name: expected text such as cam0, got {_kind(name)}")
+    return name
+
+
+def _pixels(entry: Mapping[str, Any], key: str, at: str) -> int:
+    value = _required(entry, key, at)
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise RigError(f"{at}: key {key}: expected a whole number of pixels, got {_kind(value)}")
+    return value
+
+
+def _intrinsics(entry: Mapping[str, Any], at: str) -> Array:
+    """K as three rows, or as ROS writes it: nine numbers in a row."""
+    K = _numbers(_required(entry, "K", at), (3, 3), f"{at}: key K")
+    if K[2].tolist() != [0.0, 0.0, 1.0] and K.any():  # an all-zero K gets the message of Camera, which explains it
+        raise RigError(f"{at}: key K: expected the last row 0 0 1, got {K[2].tolist()}")
+    return K
+
+
+def _camera_pose(value: Any, at: str) -> Array:
+    """T_world_camera from a 4x4 matrix (nested or flat) or from translation and quaternion."""
+    at = f"{at}: key T_world_camera"
+    if not isinstance(value, Mapping):
+        T = _numbers(value, (4, 4), at)
+        if np.abs(T[3] - [0.0, 0.0, 0.0, 1.0]).max() > 1e-9:
+            raise RigError(f"{at}: expected the last row 0 0 0 1, got {T[3].tolist()}; is the matrix transposed?")
+        return T
+    _known_keys(value, ("translation", "quaternion"), at)
+    quaternion = _numbers(_required(value, "quaternion", at), (4,), f"{at}.quaternion")
+    length = float(np.linalg.norm(quaternion))
+    if abs(length - 1.0) > 1e-3:
+        raise RigError(
+            f"{at}.quaternion: expected x y z w of length 1, got {quaternion.tolist()} of length {length:.4g}"
+        )
+    x, y, z, w = quaternion / length
+    T = np.eye(4)
+    T[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    T[:3, 3] = _numbers(_required(value, "translation", at), (3,), f"{at}.translation")
+    return T
+
+
+def _volume(value: Any, source: str) -> tuple[Array, Array]:
+    at = f"{source}: key volume"
+    if not isinstance(value, Mapping):
+        raise RigError(f"{at}: expected min and max corners, got {_kind(value)}")
+    _known_keys(value, ("min", "max"), at)
+    low, high = (_numbers(_required(value, key, at), (3,), f"{at}.{key}") for key in ("min", "max"))
+    return low, high
+
+
+def _required(entry: Mapping[str, Any], key: str, at: str) -> Any:
+    if key not in entry:
+        raise RigError(f"{at}: key {key} is missing; it has {', '.join(map(str, entry)) or 'no keys'}")
+    return entry[key]
+
+
+def _known_keys(entry: Mapping[str, Any], known: Sequence[str], at: str) -> None:
+    for key in entry:
+        if key not in known:
+            raise RigError(f"{at}: unknown key {key!r}; expected {', '.join(known)}")
+
+
+def _numbers(value: Any, shape: tuple[int, ...] | None, at: str) -> Array:
+    """Plain values -> array of `shape` (a flat list of the right length will do; None: any flat list)."""
+    expected = "a list of numbers" if shape is None else f"{'x'.join(map(str, shape))} numbers"
+    try:
+        array = (
+            np.array(value, dtype=np.float64) if isinstance(value, Sequence) and not isinstance(value, str) else None
+        )
+    except (TypeError, ValueError):  # text or nothing among the numbers, or rows of different lengths
+        array = None
+    if array is None:
+        raise RigError(f"{at}: expected {expected}, got {_kind(value)}")
+    if shape is None:
+        shape = (array.size,)
+    if array.shape != shape and array.shape != (int(np.prod(shape)),):
+        raise RigError(f"{at}: expected {expected}, got {'x'.join(map(str, array.shape))}")
+    if not np.isfinite(array).all():
+        raise RigError(f"{at}: expected finite numbers, got {array.tolist()}")
+    return array.reshape(shape)
+
+
+def _kind(value: Any) -> str:
+    """A value in a few words, for messages."""
+    if value is None:
+        return "nothing"
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def _row(values: Array) -> str:
+    return f"[{', '.join(repr(float(v)) for v in values)}]"
