@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Hull -> its surface: points, normals, curvature (paper section 2.1, eq. 1)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from limbloc_ros.core import _surface_kernels as kernels
+from limbloc_ros.core.errors import InputError
+from limbloc_ros.core.hull import Hull
+
+Array = NDArray[np.float64]
+
+#: A surface voxel is inside with an outside face neighbour, so along any direction that leaves the hull the surface
+#: is at most a voxel diagonal away.
+REACH_VOXELS = 2.0
+
+
+@dataclass(frozen=True)
+class Surface:
+    """The outer surface of a hull, one point per surface voxel (largest component only).
+
+    Attributes:
+        voxel_m: edge length of a voxel, m.
+        indices: int32 [N, 3] lattice indices of the surface voxels, in array order.
+        points: [N, 3] m, world; the voxel centre pushed along its normal onto sdf = 0.
+        normals: [N, 3] unit normals, outward.
+        curvature: [N] rad; mean angle between a voxel's normal and its neighbours' (0 on a plane).
+        neighbours: int32 [N, 26] rows of the neighbouring surface voxels, -1 where there is none.
+    """
+
+    voxel_m: float
+    indices: NDArray[np.int32]
+    points: Array
+    normals: Array
+    curvature: Array
+    neighbours: NDArray[np.int32]
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    @property
+    def centres(self) -> Array:
+        """[N, 3] voxel centres, m, world."""
+        return np.asarray((self.indices + 0.5) * self.voxel_m, dtype=np.float64)
+
+
+def extract_surface(hull: Hull, *, volume: Literal["sdf", "occupancy"] = "sdf") -> Surface:
+    """The surface of `hull` with normals and curvature (paper section 2.1).
+
+    Args:
+        hull: the visual hull.
+        volume: what the Sobel filter of eq. 1 reads. `occupancy` is the paper's (1 inside, 0 outside); `sdf`, the
+            default, gives the same normals without the staircase of a binary volume.
+
+    Raises:
+        InputError: the hull has no voxel inside.
+    """
+    sdf = np.ascontiguousarray(hull.sdf, dtype=np.float32)
+    local, number = kernels.list_surface(sdf)
+    if len(local) == 0:
+        raise InputError("expected a hull with voxels inside (sdf < 0), got an empty one; check the masks and the rig")
+    neighbours = kernels.list_neighbours(local, number, kernels.OFFSETS)
+    local, neighbours = _largest_component(local, neighbours)
+
+    filtered = sdf if volume == "sdf" else (sdf >= 0).astype(np.float32)
+    normals = kernels.normalise_outward(kernels.sobel_at(filtered, local), sdf, local)
+    steps = kernels.crossing_along_normal(sdf, local, normals, REACH_VOXELS)
+    indices = local + np.asarray(hull.index_min, dtype=np.int32)
+    return Surface(
+        voxel_m=hull.voxel_m,
+        indices=indices,
+        points=(indices + 0.5 + steps[:, None] * normals) * hull.voxel_m,
+        normals=normals,
+        curvature=kernels.mean_neighbour_angle(normals, neighbours),
+        neighbours=neighbours,
+    )
+
+
+def curvature_variability(surface: Surface, radius_m: float) -> tuple[Array, Array]:
+    """Mean and standard deviation of the curvature over the patch around each point (paper section 2.1, fig. 4).
+
+    The face "shows a high variability of the curvature": a large deviation over a patch of a head's size.
+
+    Args:
+        surface: the surface.
+        radius_m: radius of the patch, m; a patch never jumps over a gap.
+
+    Returns:
+        mean [N] and standard deviation [N], rad.
+    """
+    mean, deviation = kernels.spread_in_ball(surface.curvature, surface.points, surface.neighbours, float(radius_m))
+    return mean, deviation
+
+
+def _largest_component(
+    local: NDArray[np.int32], neighbours: NDArray[np.int32]
+) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Drop all but the largest connected piece: specks, and the inner walls of cavities."""
+    label, sizes = kernels.label_components(neighbours)
+    if len(sizes) == 1:
+        return local, neighbours
+    keep = label == np.argmax(sizes)
+    row = np.cumsum(keep, dtype=np.int32) - 1
+    kept = neighbours[keep]
+    return local[keep], np.where(kept >= 0, row[kept], np.int32(-1)).astype(np.int32)
