@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Hull and surface <-> sensor_msgs/PointCloud2.
+
+The hull's cloud holds the inside and a thin shell: per voxel its centre (`x y z`, so that RViz shows it as it is), the
+signed distance `sdf` in metres, and what rebuilds the exact grid of the offline path: the lattice indices `i j k`, the
+voxel size and the band in whole micrometres. An empty cloud says that nobody is there.
+"""
+
+from __future__ import annotations
+
+from array import array
+
+import numpy as np
+from numpy.typing import NDArray
+from sensor_msgs.msg import PointCloud2, PointField
+from std_msgs.msg import Header
+
+from limbloc_ros.core.errors import InputError
+from limbloc_ros.core.hull import Hull
+from limbloc_ros.core.surface import Surface
+
+HULL_POINT = np.dtype(
+    {
+        "names": ["x", "y", "z", "sdf", "i", "j", "k", "voxel_um", "band_um"],
+        "formats": ["<f4", "<f4", "<f4", "<f4", "<i2", "<i2", "<i2", "<u4", "<u4"],
+        "offsets": [0, 4, 8, 12, 16, 18, 20, 24, 28],
+        "itemsize": 32,
+    }
+)
+SURFACE_POINT = np.dtype(
+    [(name, "<f4") for name in ("x", "y", "z", "normal_x", "normal_y", "normal_z", "curvature", "geodesic")]
+)
+
+_DATATYPES = {"<f4": PointField.FLOAT32, "<i2": PointField.INT16, "<u4": PointField.UINT32}
+
+
+def _fields(point: np.dtype) -> list[PointField]:
+    fields = point.fields or {}
+    return [
+        PointField(name=name, offset=fields[name][1], datatype=_DATATYPES[fields[name][0].str], count=1)
+        for name in point.names or ()
+    ]
+
+
+_HULL_FIELDS = _fields(HULL_POINT)
+_SURFACE_FIELDS = _fields(SURFACE_POINT)
+
+
+def _cloud(points: NDArray[np.void], fields: list[PointField], header: Header) -> PointCloud2:
+    data = array("B")
+    data.frombytes(points.tobytes())
+    return PointCloud2(
+        header=header,
+        height=1,
+        width=len(points),
+        fields=fields,
+        is_bigendian=False,
+        point_step=points.dtype.itemsize,
+        row_step=len(data),
+        data=data,
+        is_dense=True,
+    )
+
+
+def check_voxel_size(voxel_m: float, band_m: float) -> None:
+    """The cloud carries both in whole micrometres, so that the receiver gets the very same numbers.
+
+    Raises:
+        InputError: one of them is not a whole number of micrometres.
+    """
+    for name, value in (("voxel_m", voxel_m), ("band_m", band_m)):
+        if round(value * 1e6) / 1e6 != value:
+            raise InputError(f"{name}: expected a whole number of micrometres, got {value!r} m; round it to 6 decimals")
+
+
+def hull_to_cloud(hull: Hull, header: Header) -> PointCloud2:
+    """The inside and the shell of a hull, one point per voxel (see the module's text).
+
+    Raises:
+        InputError: sizes that are not whole micrometres, or a hull more than 32767 voxels from the world's origin.
+    """
+    check_voxel_size(hull.voxel_m, hull.band_m)
+    indices, sdf = hull.shell()
+    if len(indices) and (indices.min() < -32768 or indices.max() > 32767):
+        raise InputError(
+            f"the hull's voxels have indices {indices.min()} to {indices.max()}; expected -32768 to 32767: "
+            "move the world's origin into the room, or use larger voxels"
+        )
+    points = np.zeros(len(indices), HULL_POINT)
+    centres = (indices + 0.5) * hull.voxel_m
+    for axis in range(3):
+        points["xyz"[axis]] = centres[:, axis]
+        points["ijk"[axis]] = indices[:, axis]
+    points["sdf"] = sdf
+    points["voxel_um"] = round(hull.voxel_m * 1e6)
+    points["band_um"] = round(hull.band_m * 1e6)
+    return _cloud(points, _HULL_FIELDS, header)
+
+
+def empty_hull_cloud(header: Header) -> PointCloud2:
+    """Nobody is there at this instant."""
+    return _cloud(np.zeros(0, HULL_POINT), _HULL_FIELDS, header)
+
+
+def cloud_to_hull(msg: PointCloud2) -> Hull | None:
+    """The hull that was sent, its grid bit for bit; None when the cloud is empty.
+
+    Names of cameras do not travel with the cloud: `cameras` and `rejected` are empty.
+
+    Raises:
+        InputError: not a hull's cloud, truncated, or numbers that no hull has.
+    """
+    got = [(f.name, f.offset, f.datatype, f.count) for f in msg.fields]
+    expected = [(f.name, f.offset, f.datatype, f.count) for f in _HULL_FIELDS]
+    if got != expected or msg.point_step != HULL_POINT.itemsize or msg.is_bigendian:
+        raise InputError(
+            f"expected a hull's cloud with fields {' '.join(f.name for f in _HULL_FIELDS)} in {HULL_POINT.itemsize} "
+            f"bytes per point, little-endian; got {' '.join(f.name for f in msg.fields)} in {msg.point_step}"
+        )
+    count = msg.width * msg.height
+    if count * HULL_POINT.itemsize != len(msg.data):
+        raise InputError(
+            f"a hull's cloud of {msg.width}x{msg.height} points needs {count * HULL_POINT.itemsize} bytes, "
+            f"got {len(msg.data)}: the message is truncated or its header wrong"
+        )
+    if count == 0:
+        return None
+    points = np.frombuffer(msg.data, HULL_POINT)
+    voxel_um, band_um = int(points["voxel_um"][0]), int(points["band_um"][0])
+    if voxel_um == 0 or band_um == 0 or (points["voxel_um"] != voxel_um).any() or (points["band_um"] != band_um).any():
+        raise InputError(f"a hull has one voxel size and one band above 0; got {voxel_um} um, {band_um} um or a mixture")
+    voxel_m, band_m = voxel_um / 1e6, band_um / 1e6
+    sdf = points["sdf"].copy()
+    if not (np.abs(sdf) < 100.0).all() or not (sdf < np.float32(band_m)).all():
+        raise InputError(f"signed distances of a hull's cloud must be finite and below the band of {band_m} m")
+    indices = np.stack([points["i"], points["j"], points["k"]], axis=1).astype(np.int32)
+    return Hull.from_shell(voxel_m, band_m, indices, sdf)
+
+
+def surface_to_cloud(surface: Surface, geodesic: NDArray[np.float64], header: Header) -> PointCloud2:
+    """Surface points with normal, curvature (rad) and geodesic distance from the centre of mass (m; figs. 1 and 4)."""
+    points = np.zeros(len(surface), SURFACE_POINT)
+    for axis, name in enumerate("xyz"):
+        points[name] = surface.points[:, axis]
+        points[f"normal_{name}"] = surface.normals[:, axis]
+    points["curvature"] = surface.curvature
+    points["geodesic"] = geodesic
+    return _cloud(points, _SURFACE_FIELDS, header)
