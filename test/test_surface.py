@@ -150,7 +150,7 @@ def test_variability_is_high_where_curvature_changes():
     q = np.sort(np.abs(surface.points - CENTRE), axis=1)
     flat = q[:, 1] < 0.05
     assert deviation[flat].max() < 1e-3
-    assert deviation[(q[:, 1] > 0.18)].min() > 0.1
+    assert deviation[(q[:, 1] > 0.18)].min() > 0.08
     one = int(np.argmax(deviation))
     patch = np.linalg.norm(surface.points - surface.points[one], axis=1) <= 0.06  # convex: nothing to jump over
     assert mean[one] == pytest.approx(surface.curvature[patch].mean(), rel=0.05)

@@ -20,7 +20,7 @@ OFFSETS: Ints = np.array(
 
 @njit(cache=True)
 def list_surface(sdf: NDArray[np.float32]) -> tuple[Ints, Ints]:
-    """Inside voxels with an outside face neighbour: local indices [N, 3] and the grid of their numbers (-1 elsewhere)."""
+    """Inside voxels with an outside face neighbour: local indices [N, 3]; grid of their numbers (-1 elsewhere)."""
     nx, ny, nz = sdf.shape
     number = np.full((nx, ny, nz), -1, dtype=np.int32)
     count = 0
