@@ -25,6 +25,10 @@ class InputError(LimblocError):
     """An image, mask, bag, video or folder cannot be used as it is."""
 
 
+class OutputError(LimblocError):
+    """A result or recording cannot be written: the disk is full, no permission, it exists already."""
+
+
 @dataclass(frozen=True)
 class NoPerson:
     """A frame in which no posture can be given, with the reason in words (never zeros or a silent default)."""
