@@ -1,0 +1,289 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a run leaves behind: `joints.npz`, `joint_angles.csv`, `run.npz` and `run.json`.
+
+| file | for |
+|---|---|
+| `joints.npz` | `joints` [F, 25, 3] and `sigma` [F, 25] in m, `joint_names`, `stamps` in s, `energy`, `reliable` |
+| `joint_angles.csv` | a row per frame: stamp in s, every native joint angle in rad, energy, reliable |
+| `run.npz` | everything of every pose, so that `Run.load` gives the poses back (for the report) |
+| `run.json` | what was run on what, for people: input, rig, settings, counts |
+
+NaN where there is no pose; the reason stands in `run.npz`. Files appear complete or not at all.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import io
+import json
+import math
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from limbloc_ros.core.errors import InputError, NoPerson
+from limbloc_ros.core.pose import JOINT_NAMES, Flesh, Pose
+from limbloc_ros.recordings.cases import read_npz
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class FrameResult:
+    """What became of one frame.
+
+    Attributes:
+        stamp_ns: its acquisition stamp, ns.
+        outcome: the pose, or why there is none.
+        stage_ms: process time of each stage, ms; also of the stages before the pose.
+    """
+
+    stamp_ns: int
+    outcome: Pose | NoPerson
+    stage_ms: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Run:
+    """The results of a run, frame by frame.
+
+    Attributes:
+        frames: in the order of their stamps.
+        about: what was run on what (input, rig, settings, version), plain values.
+    """
+
+    frames: tuple[FrameResult, ...]
+    about: dict[str, Any] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    @property
+    def stamps(self) -> Array:
+        """[F] acquisition stamps, s."""
+        return np.array([frame.stamp_ns for frame in self.frames], dtype=np.float64) * 1e-9
+
+    @property
+    def joints(self) -> Array:
+        """[F, 25, 3] m in world axes, by JOINT_NAMES; NaN where there is no pose."""
+        nothing = np.full((len(JOINT_NAMES), 3), np.nan)
+        return self._rows(lambda pose: pose.joints, nothing)
+
+    @property
+    def sigma(self) -> Array:
+        """[F, 25] expected error of each joint, m; NaN where there is no pose."""
+        return self._rows(lambda pose: pose.sigma, np.full(len(JOINT_NAMES), np.nan))
+
+    @property
+    def energy(self) -> Array:
+        """[F] XOR energy (eq. 2); NaN where there is no pose."""
+        return self._rows(lambda pose: pose.energy, np.nan)
+
+    @property
+    def reliable(self) -> NDArray[np.bool_]:
+        """[F] whether the pose can be acted on; False where there is none."""
+        return np.array([isinstance(f.outcome, Pose) and f.outcome.reliable for f in self.frames], dtype=np.bool_)
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """F texts: why a frame has no pose, empty where it has one."""
+        return tuple(f.outcome.reason if isinstance(f.outcome, NoPerson) else "" for f in self.frames)
+
+    @property
+    def angle_names(self) -> tuple[str, ...]:
+        """The native joint angles, in the order in which the poses name them."""
+        return _union(tuple(f.outcome.angles) for f in self.frames if isinstance(f.outcome, Pose))
+
+    @property
+    def angles(self) -> Array:
+        """[F, A] rad, by `angle_names`; NaN where there is no pose."""
+        names = self.angle_names
+        return self._rows(
+            lambda pose: [pose.angles.get(name, math.nan) for name in names], np.full(len(names), np.nan)
+        ).reshape(len(self), len(names))
+
+    def _rows(self, value: Callable[[Pose], Any], nothing: Any) -> Array:
+        rows = [value(f.outcome) if isinstance(f.outcome, Pose) else nothing for f in self.frames]
+        return np.array(rows, dtype=np.float64).reshape(len(rows), *np.shape(nothing))
+
+    def save(self, folder: str | Path) -> None:
+        """Write all four files into `folder`, which is made if need be.
+
+        Raises:
+            InputError: the folder cannot be written to (a full disk, no permission).
+        """
+        folder = Path(folder)
+        _make_folder(folder)
+        self.save_joints(folder / "joints.npz")
+        _replace(folder / "joint_angles.csv", lambda file: file.write(self._angles_csv().encode()))
+        save_frames(self.frames, folder / "run.npz")
+        found = [f.outcome for f in self.frames if isinstance(f.outcome, Pose)]
+        summary = {
+            **self.about,
+            "frames": len(self),
+            "poses": len(found),
+            "reliable": int(self.reliable.sum()),
+            "median_energy": float(np.median([pose.energy for pose in found])) if found else None,
+        }
+        _replace(folder / "run.json", lambda file: file.write((json.dumps(summary, indent=2) + "\n").encode()))
+
+    def save_joints(self, path: str | Path) -> None:
+        """Write just the prediction file, `joints.npz` of the module's table."""
+        arrays: dict[str, Any] = {
+            "joints": self.joints,
+            "joint_names": np.array(JOINT_NAMES),
+            "stamps": self.stamps,
+            "energy": self.energy,
+            "sigma": self.sigma,
+            "reliable": self.reliable,
+        }
+        _make_folder(Path(path).parent)
+        _replace(Path(path), lambda file: np.savez_compressed(file, **arrays))
+
+    def _angles_csv(self) -> str:
+        text = io.StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow(["stamp_s", *(f"{name}_rad" for name in self.angle_names), "energy", "reliable"])
+        for frame, angles, energy, reliable in zip(self.frames, self.angles, self.energy, self.reliable, strict=True):
+            seconds = f"{frame.stamp_ns // 10**9}.{frame.stamp_ns % 10**9:09d}"
+            writer.writerow([seconds, *(f"{a:.9g}" for a in angles), f"{energy:.6g}", int(reliable)])
+        return text.getvalue()
+
+    @staticmethod
+    def load(folder: str | Path) -> Run:
+        """Read back what `save` wrote.
+
+        Raises:
+            InputError: no run was saved there, or a file is damaged.
+        """
+        folder = Path(folder)
+        if not (folder / "run.npz").is_file():
+            raise InputError(
+                f"{folder} holds no finished run: expected run.npz in it; make one with `process INPUT --out {folder}`"
+            )
+        about = json.loads((folder / "run.json").read_text()) if (folder / "run.json").is_file() else {}
+        return Run(load_frames(folder / "run.npz"), about)
+
+
+def save_frames(frames: Sequence[FrameResult], path: Path) -> None:
+    """Write frames with all that is in their poses; `load_frames` gives the same numbers back, bit for bit."""
+    poses = [f.outcome for f in frames if isinstance(f.outcome, Pose)]
+    stages = _union(tuple(f.stage_ms) for f in frames)
+    arrays: dict[str, Any] = {
+        "stamps_ns": np.array([f.stamp_ns for f in frames], dtype=np.int64),
+        "found": np.array([isinstance(f.outcome, Pose) for f in frames], dtype=np.bool_),
+        "reasons": np.array(
+            [f.outcome.reason if isinstance(f.outcome, NoPerson) else "" for f in frames], dtype=np.str_
+        ),
+        "stage_names": np.array(stages, dtype=np.str_),
+        "stage_ms": np.array([[f.stage_ms.get(s, np.nan) for s in stages] for f in frames], dtype=np.float64),
+    }
+    # The figure's layout is the engine's: equal in every pose of a run, so that each field is one array.
+    if poses:
+        first = poses[0]
+        arrays |= {
+            "bone_names": np.array(first.bone_names),
+            "angle_names": np.array(list(first.angles)),
+            "size_names": np.array(list(first.sizes)),
+            "pose_stage_names": np.array(_union(tuple(p.stage_ms) for p in poses), dtype=np.str_),
+            "flesh_parts": first.flesh.parts,
+            "flesh_part_names": np.array(first.flesh.part_names),
+            "joints": np.array([p.joints for p in poses]),
+            "rotations": np.array([p.rotations for p in poses]),
+            "angles": np.array([[p.angles[n] for n in first.angles] for p in poses]),
+            "sizes": np.array([[p.sizes[n] for n in first.sizes] for p in poses]),
+            "flesh_centres": np.array([p.flesh.centres for p in poses]),
+            "flesh_radii": np.array([p.flesh.radii for p in poses]),
+            "parameters": np.array([p.parameters for p in poses]),
+            "energy": np.array([p.energy for p in poses]),
+            "sigma": np.array([p.sigma for p in poses]),
+            "reliable": np.array([p.reliable for p in poses]),
+        }
+        names = arrays["pose_stage_names"]
+        arrays["pose_stage_ms"] = np.array([[p.stage_ms.get(str(s), np.nan) for s in names] for p in poses])
+    _replace(path, lambda file: np.savez_compressed(file, **arrays))
+
+
+def load_frames(path: Path) -> tuple[FrameResult, ...]:
+    """Read what `save_frames` wrote; raises InputError when the file is damaged."""
+    data = read_npz(path)
+    try:
+        return tuple(_frames(data))
+    except (KeyError, IndexError) as error:
+        raise InputError(f"{path} is not a results file of this version ({error}); run `process` again") from None
+
+
+def _frames(data: dict[str, NDArray[Any]]) -> list[FrameResult]:
+    frames, row = [], 0
+    stages = [str(s) for s in data["stage_names"]]
+    for i, found in enumerate(data["found"]):
+        outcome: Pose | NoPerson = NoPerson(str(data["reasons"][i]))
+        if found:
+            outcome = _pose(data, row)
+            row += 1
+        frames.append(FrameResult(int(data["stamps_ns"][i]), outcome, _times(stages, data["stage_ms"][i])))
+    return frames
+
+
+def _pose(data: dict[str, NDArray[Any]], row: int) -> Pose:
+    def named(names: str, values: str) -> dict[str, float]:
+        return {str(n): float(v) for n, v in zip(data[names], data[values][row], strict=True)}
+
+    return Pose(
+        joints=data["joints"][row],
+        rotations=data["rotations"][row],
+        bone_names=tuple(str(n) for n in data["bone_names"]),
+        angles=named("angle_names", "angles"),
+        sizes=named("size_names", "sizes"),
+        flesh=Flesh(
+            data["flesh_centres"][row],
+            data["flesh_radii"][row],
+            data["flesh_parts"],
+            tuple(str(n) for n in data["flesh_part_names"]),
+        ),
+        parameters=data["parameters"][row],
+        energy=float(data["energy"][row]),
+        sigma=data["sigma"][row],
+        reliable=bool(data["reliable"][row]),
+        stage_ms=_times([str(s) for s in data["pose_stage_names"]], data["pose_stage_ms"][row]),
+    )
+
+
+def _times(names: Sequence[str], values: Array) -> dict[str, float]:
+    return {name: float(value) for name, value in zip(names, values, strict=True) if not math.isnan(value)}
+
+
+def _union(groups: Any) -> tuple[str, ...]:
+    """All names of all groups, each once, in the order of their first appearance."""
+    return tuple(dict.fromkeys(name for group in groups for name in group))
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"output folder {folder} cannot be made: {error.strerror}") from None
+
+
+def _replace(path: Path, write: Callable[[IO[bytes]], Any]) -> None:
+    """Write a file under a temporary name and rename it: no reader ever sees half of it."""
+    temporary = path.with_name(f".{path.name}.writing")
+    try:
+        with temporary.open("wb") as file:
+            write(file)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except OSError as error:
+        with contextlib.suppress(OSError):  # the disk may be gone altogether; the first error is the one to tell
+            temporary.unlink(missing_ok=True)
+        raise InputError(
+            f"{path} cannot be written: {error.strerror or error}; make room or choose another --out, "
+            "then run the same command again: finished frames are kept"
+        ) from None
