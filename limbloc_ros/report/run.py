@@ -1,0 +1,204 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a report is made from: the results of a run, and a few of its frames with hull and pose."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from limbloc_ros import __version__
+from limbloc_ros.core.camera import Rig
+from limbloc_ros.core.errors import InputError
+from limbloc_ros.core.geodesic import geodesic_map
+from limbloc_ros.core.hull import Hull
+from limbloc_ros.core.pose import JOINT, JOINT_NAMES, STICK_BONES, Array, Pose
+from limbloc_ros.core.surface import Surface, extract_surface
+
+#: The joints that the benchmark scores: the head and the limbs.
+LIMB_JOINTS = (
+    "head_centre",
+    *(f"{joint}_{side}" for joint in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle") for side in "LR"),
+)
+
+#: A step between consecutive frames is a jump when it is this many times the joint's usual one and at least so long.
+JUMP_RATIO, JUMP_M, JUMP_RAD = 5.0, 0.15, np.radians(40.0)
+
+
+@dataclass(frozen=True)
+class RunData:
+    """The results of a run over F frames; NaN where a frame has no person.
+
+    Attributes:
+        title: heading of the report.
+        source: what was processed, in words.
+        joints: [F, 25, 3] m, in the order of JOINT_NAMES.
+        stamps: [F] s.
+        energy: [F] XOR energy (eq. 2).
+        sigma: [F, 25] expected error of each joint, m.
+        reliable: bool [F].
+        stage_ms: stage -> [F] process time, ms.
+        angles: joint angle -> [F] rad.
+        missing: frame -> why it has no person.
+        truth: [F, 25, 3] true joints, m, when they are known.
+        settings: what the run was made with (parameters, number of cameras), shown as they are.
+        command: the command line that made it.
+        version: of limbloc_ros.
+        consecutive: False when the frames are unrelated poses; then no lines are drawn and no jumps sought.
+    """
+
+    title: str
+    source: str
+    joints: Array
+    stamps: Array
+    energy: Array
+    sigma: Array
+    reliable: NDArray[np.bool_]
+    stage_ms: Mapping[str, Array] = field(default_factory=dict)
+    angles: Mapping[str, Array] = field(default_factory=dict)
+    missing: Mapping[int, str] = field(default_factory=dict)
+    truth: Array | None = None
+    settings: Mapping[str, str] = field(default_factory=dict)
+    command: str = ""
+    version: str = __version__
+    consecutive: bool = True
+
+    def __post_init__(self) -> None:
+        frames = len(self.joints)
+        if frames == 0:
+            raise InputError("a report needs at least one frame, got a run of none")
+        shapes = {
+            "joints": (frames, len(JOINT_NAMES), 3),
+            "stamps": (frames,),
+            "energy": (frames,),
+            "sigma": (frames, len(JOINT_NAMES)),
+            "reliable": (frames,),
+        }
+        values: dict[str, Any] = {name: getattr(self, name) for name in shapes}
+        if self.truth is not None:
+            shapes["truth"], values["truth"] = shapes["joints"], self.truth
+        for kind in ("stage_ms", "angles"):
+            for name, value in getattr(self, kind).items():
+                shapes[f"{kind} {name}"], values[f"{kind} {name}"] = (frames,), value
+        for name, shape in shapes.items():
+            if np.shape(values[name]) != shape:
+                raise InputError(f"{name}: expected shape {shape}, got {np.shape(values[name])}")
+
+    @property
+    def found(self) -> NDArray[np.bool_]:
+        """[F] frames with a person."""
+        return np.asarray(np.isfinite(self.joints.sum(axis=2)).any(axis=1))
+
+    @property
+    def seconds(self) -> Array:
+        """[F] time since the first frame, s."""
+        return np.asarray(self.stamps - self.stamps[0])
+
+    @property
+    def total_ms(self) -> Array:
+        """[F] process time of all stages together, ms; NaN where no stage has one."""
+        if not self.stage_ms:
+            return np.full(len(self.joints), np.nan)
+        stages = np.stack(list(self.stage_ms.values()))
+        return np.where(np.isfinite(stages).any(axis=0), np.nansum(stages, axis=0), np.nan)
+
+    @property
+    def error_m(self) -> Array | None:
+        """[F, 25] distance from the true joints, m; None when they are not known."""
+        return None if self.truth is None else np.asarray(np.linalg.norm(self.joints - self.truth, axis=2))
+
+    def joint_path(self, name: str) -> Array:
+        """[F, 3] where the joint `name` was, m."""
+        return np.asarray(self.joints[:, JOINT[name]])
+
+    def missing_reasons(self) -> list[tuple[str, int]]:
+        """Why frames have no person, and how often, the most frequent first."""
+        lost = np.flatnonzero(~self.found)
+        return Counter(self.missing.get(int(f), "no reason was recorded") for f in lost).most_common()
+
+    def bone_lengths(self) -> dict[str, Array]:
+        """[F] length of each bone of the stick figure, m, by `from - to`."""
+        return {
+            f"{a} - {b}": np.asarray(np.linalg.norm(self.joint_path(b) - self.joint_path(a), axis=1))
+            for a, b in STICK_BONES
+        }
+
+
+def steps(values: Array) -> Array:
+    """How far a quantity moved since the frame before: [F] for [F] or [F, D]; NaN at the first and next to a gap."""
+    moved = np.diff(values.reshape(len(values), -1), axis=0)
+    return np.concatenate([[np.nan], np.linalg.norm(moved, axis=1)])
+
+
+def jumps(values: Array, least: float) -> NDArray[np.bool_]:
+    """Frames at which a path breaks: a step of at least `least` that is also far longer than its usual step.
+
+    Args:
+        values: [F] or [F, D]; NaN where missing. A step over a gap is not judged.
+        least: shortest step that counts, in the unit of `values`.
+    """
+    step = steps(values)
+    if not np.isfinite(step).any():
+        return np.zeros(len(values), dtype=np.bool_)
+    return np.asarray(np.nan_to_num(step) > max(least, JUMP_RATIO * float(np.nanmedian(step))))
+
+
+def joint_jumps(run: RunData) -> dict[str, NDArray[np.bool_]]:
+    """[F] frames at which each joint jumps; empty for unrelated frames."""
+    return {name: jumps(run.joint_path(name), JUMP_M) for name in JOINT_NAMES} if run.consecutive else {}
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One frame of the run with everything that its pictures need.
+
+    Attributes:
+        frame_index: which frame.
+        hull: its visual hull.
+        surface: the hull's surface.
+        geodesic: [N] geodesic distance of each surface point from the centre of mass, m (inf where out of reach).
+        pose: the fitted pose.
+        anchors: points that the paper's engine went by, [3] m by name (`knee_L`, ...), for figs. 6 and 7.
+        images: camera name -> uint8 bgr [H, W, 3] image or [H, W] mask, for overlays; empty for none.
+        rig: the cameras of the images.
+    """
+
+    frame_index: int
+    hull: Hull
+    surface: Surface
+    geodesic: Array
+    pose: Pose
+    anchors: Mapping[str, Array] = field(default_factory=dict)
+    images: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)
+    rig: Rig | None = None
+
+    @staticmethod
+    def of(
+        frame_index: int,
+        hull: Hull,
+        pose: Pose,
+        *,
+        anchors: Mapping[str, Array] | None = None,
+        images: Mapping[str, NDArray[np.uint8]] | None = None,
+        rig: Rig | None = None,
+    ) -> Sample:
+        """A sample whose surface and geodesic map are worked out from the hull."""
+        surface = extract_surface(hull)
+        return Sample(frame_index, hull, surface, geodesic_map(hull, surface), pose, anchors or {}, images or {}, rig)
+
+
+def choose_frames(found: Sequence[bool] | NDArray[np.bool_], count: int = 6) -> list[int]:
+    """Up to `count` frames with a person, spread evenly over the run, in order.
+
+    Args:
+        found: [F] which frames have a person.
+        count: how many to choose, at least 1.
+    """
+    frames = np.flatnonzero(found)
+    if len(frames) <= count:
+        return [int(f) for f in frames]
+    return [int(frames[round(k)]) for k in np.linspace(0, len(frames) - 1, 2 * count + 1)[1::2]]
