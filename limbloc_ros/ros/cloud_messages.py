@@ -9,6 +9,7 @@ voxel size and the band in whole micrometres. An empty cloud says that nobody is
 from __future__ import annotations
 
 from array import array
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,8 +35,8 @@ SURFACE_POINT = np.dtype(
 _DATATYPES = {"<f4": PointField.FLOAT32, "<i2": PointField.INT16, "<u4": PointField.UINT32}
 
 
-def _fields(point: np.dtype) -> list[PointField]:
-    fields = point.fields or {}
+def _fields(point: np.dtype[np.void]) -> list[PointField]:
+    fields: Any = point.fields
     return [
         PointField(name=name, offset=fields[name][1], datatype=_DATATYPES[fields[name][0].str], count=1)
         for name in point.names or ()
@@ -128,7 +129,9 @@ def cloud_to_hull(msg: PointCloud2) -> Hull | None:
     points = np.frombuffer(msg.data, HULL_POINT)
     voxel_um, band_um = int(points["voxel_um"][0]), int(points["band_um"][0])
     if voxel_um == 0 or band_um == 0 or (points["voxel_um"] != voxel_um).any() or (points["band_um"] != band_um).any():
-        raise InputError(f"a hull has one voxel size and one band above 0; got {voxel_um} um, {band_um} um or a mixture")
+        raise InputError(
+            f"a hull has one voxel size and one band above 0; got {voxel_um} um, {band_um} um or a mixture"
+        )
     voxel_m, band_m = voxel_um / 1e6, band_um / 1e6
     sdf = points["sdf"].copy()
     if not (np.abs(sdf) < 100.0).all() or not (sdf < np.float32(band_m)).all():

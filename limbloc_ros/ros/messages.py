@@ -95,7 +95,9 @@ def message_to_angles(msg: JointState) -> dict[str, float]:
         InputError: not one position per name.
     """
     if len(msg.name) != len(msg.position):
-        raise InputError(f"expected one position per joint, got {len(msg.name)} names and {len(msg.position)} positions")
+        raise InputError(
+            f"expected one position per joint, got {len(msg.name)} names and {len(msg.position)} positions"
+        )
     return dict(zip(msg.name, msg.position, strict=True))
 
 
@@ -112,7 +114,9 @@ def figure_to_markers(pose: Pose, header: Header) -> MarkerArray:
     joints.colors = [_LEFT if n.endswith("_L") else _RIGHT if n.endswith("_R") else _MIDDLE for n in JOINT]
     flesh = _marker(header, "flesh", Marker.TRIANGLE_LIST, 1.0, _FLESH if pose.reliable else _DOUBTFUL)
     flesh.points = _points(
-        np.concatenate([vertices[faces].reshape(-1, 3) for vertices, faces in flesh_mesh(pose.flesh, FLESH_SUBDIVISIONS)])
+        np.concatenate(
+            [vertices[faces].reshape(-1, 3) for vertices, faces in flesh_mesh(pose.flesh, FLESH_SUBDIVISIONS)]
+        )
     )
     return MarkerArray(markers=[stick, joints, flesh])
 
@@ -172,7 +176,9 @@ def message_to_transform(msg: TransformStamped) -> Array:
 OK, WARN, ERROR, STALE = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR, DiagnosticStatus.STALE
 
 
-def make_status(name: str, level: bytes, message: str, values: Mapping[str, Any], hardware: str = "") -> DiagnosticStatus:
+def make_status(
+    name: str, level: bytes, message: str, values: Mapping[str, Any], hardware: str = ""
+) -> DiagnosticStatus:
     """One entry of `/diagnostics`; floats are given with four significant digits."""
     pairs = [KeyValue(key=k, value=f"{v:.4g}" if isinstance(v, float) else str(v)) for k, v in values.items()]
     return DiagnosticStatus(name=name, level=level, message=message, values=pairs, hardware_id=hardware)

@@ -70,7 +70,7 @@ class NodeParameters:
         values = {name: self._node.get_parameter_or(name).value for name in names}
         section = _Section(kind, names, _build(kind, names, values), on_change)
         self._sections.append(section)
-        return section.value  # type: ignore[no-any-return]
+        return section.value
 
     def _changed(self, parameters: Sequence[Parameter]) -> list[tuple[_Section[Any], Any]]:
         """The sections that the new values touch, with what they become."""

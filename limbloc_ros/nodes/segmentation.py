@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Camera image -> mask of the person (paper section 1); one node per camera."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from rclpy.node import Node
+from sensor_msgs.msg import CompressedImage, Image
+from std_srvs.srv import SetBool, Trigger
+
+from limbloc_ros.core.background import BackgroundModel, Segmentation
+from limbloc_ros.core.config import BackgroundConfig, setting
+from limbloc_ros.ros import image_messages, node_main, topics
+from limbloc_ros.ros.health import Health, Meter
+from limbloc_ros.ros.messages import ERROR, OK, WARN, make_status, stamp_ns
+from limbloc_ros.ros.parameters import NodeParameters
+
+#: Longer without an image is worth a warning.
+SILENT_S = 2.0
+
+
+@dataclass(frozen=True)
+class SegmentationSettings:
+    """What only this node needs to know."""
+
+    camera: str = setting("camera", "name of the camera, the prefix of its topics")
+    transport: str = setting("raw", "which of the camera's topics is read", choices=("raw", "compressed"))
+    reliability: str = setting(
+        "best_effort",
+        "of the image subscription; best_effort works with every camera",
+        choices=("best_effort", "reliable"),
+    )
+    publish: str = setting("on_demand", "masks nobody subscribed to are left out", choices=("on_demand", "always"))
+
+
+class SegmentationNode(Node):
+    """Subscribes to a camera's images and publishes `<camera>/mask` and `<camera>/mask/compressed`."""
+
+    def __init__(self, node_name: str = "segmentation", **node_options: Any) -> None:
+        super().__init__(node_name, **node_options)
+        parameters = NodeParameters(self)
+        self.settings = parameters.declare(SegmentationSettings)
+        self.model = BackgroundModel(parameters.declare(BackgroundConfig, "background", self._on_config))
+        self.last: Segmentation | None = None
+        self.meter = Meter()
+        camera = self.settings.camera
+        self.raw_mask = self.create_publisher(Image, topics.mask(camera), topics.STREAM_QOS)
+        self.png_mask = self.create_publisher(CompressedImage, topics.mask_compressed(camera), topics.STREAM_QOS)
+        self.health = Health(self, self.describe)
+        qos = topics.image_subscription(self.settings.reliability)
+        if self.settings.transport == "raw":
+            self.topic, kind = topics.image(camera), Image
+        else:
+            self.topic, kind = topics.image_compressed(camera), CompressedImage
+        self.create_subscription(kind, self.topic, self.on_image, qos)
+        self.create_service(Trigger, topics.RECAPTURE_BACKGROUND, self.on_recapture)
+        self.create_service(SetBool, topics.FREEZE_BACKGROUND, self.on_freeze)
+
+    def on_image(self, msg: Image | CompressedImage) -> None:
+        """One image: segment it, publish its mask with the image's stamp and frame."""
+        with self.health.guard(f"camera {self.settings.camera}"):
+            self.last = self.model.segment(image_messages.message_to_pixels(msg))
+            always = self.settings.publish == "always"
+            if always or self.raw_mask.get_subscription_count():
+                self.raw_mask.publish(image_messages.mask_to_image(self.last.mask, msg.header))
+            if always or self.png_mask.get_subscription_count():
+                self.png_mask.publish(image_messages.mask_to_compressed(self.last.mask, msg.header))
+            self.meter.tick(self.health.latency_s(stamp_ns(msg.header)))
+
+    def on_recapture(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Learn the background anew from the next images."""
+        self.model.recapture()
+        response.success = True
+        response.message = f"learning the background of {self.settings.camera}: keep the room empty"
+        return response
+
+    def on_freeze(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        """Stop or resume the background's slow update."""
+        self.model.freeze(request.data)
+        response.success = True
+        response.message = f"background of {self.settings.camera} {'frozen' if request.data else 'follows the light'}"
+        return response
+
+    def describe(self) -> Sequence[DiagnosticStatus]:
+        """Rate, latency, how much is foreground, and whether it still learns."""
+        level, message, fill = OK, "segmenting", float("nan")
+        if self.last is not None:
+            fill = 100.0 * float((self.last.mask != 0).mean())
+            if self.last.learning:
+                level, message = WARN, "learning the background: keep the room empty"
+        if self.meter.silence_s > SILENT_S:
+            publishers = self.count_publishers(self.topic)
+            why = "nobody publishes it" if publishers == 0 else f"{publishers} publisher(s), but no usable image came"
+            level, message = ERROR, f"no image on {self.topic} for {self.meter.silence_s:.0f} s: {why}"
+        values = {
+            "rate_hz": self.meter.rate_hz,
+            "latency_ms": self.meter.latency_ms,
+            "mask_fill_percent": fill,
+            "learning": self.last is not None and self.last.learning,
+        }
+        return [make_status(f"{self.get_name()}: mask", level, message, values, self.settings.camera)]
+
+    def _on_config(self, config: BackgroundConfig) -> None:
+        self.model.config = config
+
+
+def main() -> int:
+    """Run one segmentation node."""
+    return node_main.main(SegmentationNode)

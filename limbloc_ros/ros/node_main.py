@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Starting, spinning and stopping nodes, alone or several in one process."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+
+import cv2
+import rclpy
+from rclpy.context import Context
+from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
+from rclpy.logging import get_logger
+from rclpy.node import Node
+
+from limbloc_ros.core.errors import LimblocError
+
+
+def make_executor(context: Context | None = None) -> Executor:
+    """The events executor, five times cheaper per callback, where rclpy has it; else the single-threaded one."""
+    try:
+        from rclpy.experimental import EventsExecutor
+    except ImportError:
+        return SingleThreadedExecutor(context=context)
+    return EventsExecutor(context=context)
+
+
+def spin(
+    nodes: Sequence[Node],
+    context: Context | None = None,
+    until: Callable[[], bool] | None = None,
+    timeout_s: float | None = None,
+) -> bool:
+    """Run the nodes' callbacks in this thread until the context is shut down (Ctrl-C, SIGTERM).
+
+    Args:
+        nodes: all of the same context.
+        context: the default one if None.
+        until: checked after every callback; True ends the loop.
+        timeout_s: ends the loop after this long.
+
+    Returns:
+        whether `until` became True.
+    """
+    # The EventsExecutor's own spin() ignores signals and can hang at shutdown, so the loop is ours.
+    executor = make_executor(context)
+    deadline = None if timeout_s is None else time.monotonic() + timeout_s
+    for node in nodes:
+        executor.add_node(node)
+    try:
+        while rclpy.ok(context=context):
+            if until is not None and until():
+                return True
+            if deadline is not None and time.monotonic() > deadline:
+                return False
+            executor.spin_once(timeout_sec=0.1 if until is None else 0.01)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    finally:
+        for node in nodes:
+            executor.remove_node(node)
+        executor.shutdown()
+    return False
+
+
+def main(make_nodes: Callable[[], Node | Sequence[Node]], args: Sequence[str] | None = None) -> int:
+    """The main function of a process of nodes: init, build, spin, clean shutdown.
+
+    Args:
+        make_nodes: builds the node, or several to be composed in this process.
+        args: command line with ROS arguments; the process's own if None.
+
+    Returns:
+        exit code: 0 after a clean stop, 1 when a node could not start (the reason is logged).
+    """
+    cv2.setNumThreads(1)  # one process per stage already uses the cores; OpenCV's pool only adds waiting
+    nodes: Sequence[Node] = ()
+    rclpy.init(args=None if args is None else list(args))
+    try:
+        made = make_nodes()
+        nodes = [made] if isinstance(made, Node) else made
+        spin(nodes)
+    except LimblocError as error:
+        get_logger("limbloc").fatal(str(error))
+        return 1
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    finally:
+        for node in nodes:
+            node.destroy_node()
+        rclpy.try_shutdown()
+    return 0
