@@ -69,8 +69,10 @@ class HullConfig:
         0.06, "signed distances outside the hull are kept up to this, as a thin shell", unit="m", low=0.01, high=0.5
     )
     min_cameras: int = setting(2, "fewer live masks than this give no hull", low=1, high=64, live=True)
-    max_misses: int = setting(
-        -1, "cameras that may call a voxel background while it stays (-1: chosen from the masks)", low=-1, high=16, live=True
+    repair_depth_m: float = setting(
+        0.05,
+        "a voxel that one camera denies stays when it lies this deep inside all other silhouettes (doubled below 6 cameras)",
+        unit="m", low=0.0, high=1.0, live=True,
     )
     min_voxels: int = setting(500, "smaller hulls are no person", unit="voxels", low=1, high=10_000_000, live=True)
 

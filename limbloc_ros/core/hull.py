@@ -1,17 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Masks + cameras -> the visual hull as a signed distance field (paper section 1)."""
+"""Masks + cameras -> the visual hull as a signed distance field (paper section 1).
+
+The paper keeps a voxel when every camera that sees it says foreground. Here each camera gives a signed distance
+instead of a yes or no: the distance of the projected voxel to the silhouette's outline, in pixels, times depth over
+focal length. The largest over the cameras is the hull's signed distance, good to a fraction of a voxel.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
+from limbloc_ros.core import _hull_kernels as kernels
 from limbloc_ros.core.camera import Rig
 from limbloc_ros.core.config import HullConfig
-from limbloc_ros.core.errors import NoPerson
+from limbloc_ros.core.errors import InputError, NoPerson
+from limbloc_ros.core.silhouettes import Silhouettes, measure_silhouettes, pack_cameras
+
+#: Coarsest blocks of the hierarchy, in voxels; halved until LEAF.
+ROOT, LEAF = 16, 4
 
 
 @dataclass(frozen=True)
@@ -31,8 +42,18 @@ class Hull:
     index_min: tuple[int, int, int]
     sdf: NDArray[np.float32]
     band_m: float
-    cameras: tuple[str, ...]
-    rejected: dict[str, str]
+    cameras: tuple[str, ...] = ()
+    rejected: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def origin_m(self) -> NDArray[np.float64]:
+        """[3] centre of element [0, 0, 0] in the world, m."""
+        return (np.asarray(self.index_min) + 0.5) * self.voxel_m
+
+    @property
+    def inside_count(self) -> int:
+        """Number of voxels inside."""
+        return int((self.sdf < 0).sum())
 
     def shell(self) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
         """The voxels that matter: the inside and the thin shell around it.
@@ -40,7 +61,7 @@ class Hull:
         Returns:
             lattice indices int32 [V, 3] and signed distances float32 [V] m, all below band_m, in array order.
         """
-        local = np.argwhere(self.sdf < np.float32(self.band_m))
+        local = np.stack(np.nonzero(self.sdf < np.float32(self.band_m)), axis=1)
         values = self.sdf[local[:, 0], local[:, 1], local[:, 2]]
         return (local + np.asarray(self.index_min)).astype(np.int32), values
 
@@ -53,12 +74,171 @@ class Hull:
         cameras: tuple[str, ...] = (),
         rejected: dict[str, str] | None = None,
     ) -> Hull:
-        """Rebuild from `shell()` the hull that the pose stage sees; the inverse of `shell`, bit for bit."""
-        raise NotImplementedError
+        """Rebuild from `shell()` the very same hull, bit for bit.
+
+        Raises:
+            InputError: no voxel, or voxels spread over more than 10^8 cells.
+        """
+        if len(indices) == 0 or len(indices) != len(values):
+            raise InputError(f"a hull needs as many signed distances as voxels and at least one, got {len(values)}")
+        low = indices.min(axis=0).astype(np.int64) - 1
+        shape = tuple(int(n) for n in indices.max(axis=0) - low + 2)
+        if math.prod(shape) > 100_000_000:
+            raise InputError(f"a hull of {shape} cells is too large: expected at most 10^8; use larger voxels")
+        sdf = np.full(shape, band_m, np.float32)
+        at = indices - low
+        sdf[at[:, 0], at[:, 1], at[:, 2]] = values
+        corner = (int(low[0]), int(low[1]), int(low[2]))
+        return Hull(voxel_m, corner, sdf, band_m, cameras, rejected or {})
+
+
+def lattice_bounds(rig: Rig, voxel_m: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Lowest and highest (exclusive) lattice indices whose voxel centres lie in the carve volume."""
+    low = np.ceil(rig.volume_min / voxel_m - 0.5 - 1e-9).astype(np.int64)
+    high = np.floor(rig.volume_max / voxel_m - 0.5 + 1e-9).astype(np.int64) + 1
+    return low, high
+
+
+def evaluate(
+    silhouettes: Silhouettes, rig: Rig, voxel_m: float, band_m: float, keep_second: bool = True, min_seen: int = 2
+) -> tuple[NDArray[np.int32], NDArray[np.float32], NDArray[np.float32], NDArray[np.int16]]:
+    """Signed distances of every voxel near the hull, by halving blocks that may hold some of it.
+
+    Exact: the same voxels and values as the evaluation of every voxel of the volume.
+
+    Returns:
+        indices int32 [V, 3], largest camera distance float32 [V] m, second largest float32 [V] m, and the index of
+        the camera that gave the largest int16 [V]; all voxels whose largest distance is below band_m or, with
+        keep_second, whose second largest is negative (those that a single camera denies).
+    """
+    low, high = lattice_bounds(rig, voxel_m)
+    axes = [np.arange(low[a], high[a], ROOT, dtype=np.int32) for a in range(3)]
+    blocks = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    table = (silhouettes.cameras, silhouettes.boxes, silhouettes.field)
+    size = ROOT
+    while size > LEAF:
+        blocks = kernels.split_blocks(blocks, size, *table, voxel_m, band_m, keep_second, min_seen)
+        size //= 2
+    return kernels.evaluate_blocks(blocks, size, *table, voxel_m, band_m, keep_second, min_seen, high)  # type: ignore[no-any-return]
+
+
+def reject_dead_cameras(silhouettes: Silhouettes, rig: Rig, config: HullConfig) -> Silhouettes:
+    """Take out cameras whose masks contradict all others: without them the hull grows several times.
+
+    Volumes are compared on voxels three times as large: leaving out camera c adds the voxels that only c denies.
+    """
+    coarse = 3 * config.voxel_m
+    while len(silhouettes.names) > max(config.min_cameras, 3):
+        _, first, second, who = evaluate(silhouettes, rig, coarse, 0.5 * coarse)
+        kept = int((first < 0).sum())
+        denied = np.bincount(who[(first >= 0) & (second < 0)], minlength=len(silhouettes.names))
+        worst = int(denied.argmax())
+        if denied[worst] < 2 * kept + config.min_voxels / 27:
+            break
+        others = np.delete(denied, worst)
+        if denied[worst] < 2 * others.max():
+            break
+        silhouettes = silhouettes.without(
+            silhouettes.names[worst], f"its mask denies {denied[worst] / max(kept, 1):.1f} times the hull the others agree on"
+        )
+    return silhouettes
+
+
+def mend_silhouettes(
+    silhouettes: Silhouettes,
+    indices: NDArray[np.int32],
+    first: NDArray[np.float32],
+    second: NDArray[np.float32],
+    who: NDArray[np.int16],
+    config: HullConfig,
+) -> Silhouettes:
+    """Give back to a silhouette what it lost, on the evidence of all other cameras.
+
+    Where a mask misses a limb, the strict intersection loses the limb, and then the *other* masks show foreground
+    that no part of the hull explains. So a voxel that exactly one camera denies is given back when at least two
+    other cameras see it on unexplained foreground, or when it lies so deep inside all other silhouettes that only
+    a hole in the one mask can be the reason. Consistent masks leave nothing unexplained and stay as they are.
+
+    Args:
+        silhouettes: as measured.
+        indices, first, second, who: what `evaluate` returned for them.
+        config: `repair_depth_m`, voxel size.
+
+    Returns:
+        silhouettes with the mended ones measured anew, or the very same object when nothing was to mend.
+    """
+    if len(silhouettes.names) < 3:
+        return silhouettes
+    half = 0.5 * config.voxel_m
+    denied = (first >= 0) & (second < np.float32(-0.25 * half))
+    if not denied.any():
+        return silhouettes
+    table = (silhouettes.cameras, silhouettes.boxes)
+    covered = np.zeros(silhouettes.field.size, np.uint8)
+    kernels.cover((indices[first < 0] + 0.5) * config.voxel_m, 1.75 * half, *table, covered)
+    points, deniers, depths = (indices[denied] + 0.5) * config.voxel_m, who[denied], -second[denied]
+    unexplained = kernels.count_unexplained(points, deniers, *table, silhouettes.field, covered, 1.5)
+    deep = depths > (config.repair_depth_m if len(silhouettes.names) >= 6 else 2 * config.repair_depth_m)
+    give_back = (unexplained >= 2) | deep
+    changes: dict[int, NDArray[np.uint8]] = {}
+    for c in np.unique(deniers[give_back]):
+        mine = give_back & (deniers == c)
+        mask = (silhouettes.piece(c) < 0).astype(np.uint8)
+        before = int(mask.sum())
+        kernels.paint_balls(points[mine], np.maximum(depths[mine], half), *(t[c] for t in table), mask)
+        if int(mask.sum()) > before:
+            changes[int(c)] = mask
+    return silhouettes.with_masks(changes) if changes else silhouettes
+
+
+def carve_silhouettes(silhouettes: Silhouettes, rig: Rig, config: HullConfig) -> Hull | NoPerson:
+    """Carve the hull from measured silhouettes; see `carve`."""
+    if len(silhouettes.names) < config.min_cameras:
+        reasons = "; ".join(f"{name}: {why}" for name, why in silhouettes.rejected.items())
+        return NoPerson(f"{len(silhouettes.names)} usable masks, expected at least {config.min_cameras} ({reasons})")
+    silhouettes = reject_dead_cameras(silhouettes, rig, config)
+    min_seen = min(config.min_cameras, len(silhouettes.names))
+    voxels = evaluate(silhouettes, rig, config.voxel_m, config.band_m, min_seen=min_seen)
+    mended = mend_silhouettes(silhouettes, *voxels, config)
+    if mended is not silhouettes:
+        voxels = evaluate(mended, rig, config.voxel_m, config.band_m, keep_second=False, min_seen=min_seen)
+    indices, distance = voxels[:2]
+    near = distance < np.float32(config.band_m)
+    if not (distance[near] < 0).any():
+        return NoPerson("the silhouettes have no volume in common: is anybody in the carve volume?")
+    hull = Hull.from_shell(
+        config.voxel_m, config.band_m, indices[near], distance[near], silhouettes.names, silhouettes.rejected
+    )
+    hull = largest_component(hull)
+    if hull.inside_count * (config.voxel_m / 0.02) ** 3 < config.min_voxels:
+        return NoPerson(f"the hull has only {hull.inside_count} voxels of {config.voxel_m} m: nothing of a person's size")
+    return hull
+
+
+def largest_component(hull: Hull) -> Hull:
+    """The hull with only its largest connected part and the shell around it; bridges gaps of about two voxels."""
+    labels, sizes = kernels.label_components(hull.sdf < np.float32(hull.voxel_m))
+    if len(sizes) <= 2:
+        return hull
+    part = labels == int(sizes[1:].argmax()) + 1
+    reach = math.ceil(hull.band_m / hull.voxel_m)
+    near = part.copy()
+    for axis in range(3):
+        grown = near.copy()
+        for step in range(1, reach + 1):
+            ahead, behind = [slice(None)] * 3, [slice(None)] * 3
+            ahead[axis], behind[axis] = slice(step, None), slice(None, -step)
+            grown[tuple(ahead)] |= near[tuple(behind)]
+            grown[tuple(behind)] |= near[tuple(ahead)]
+        near = grown
+    keep = near & ((labels == 0) | part)
+    sdf = np.where(keep, hull.sdf, np.float32(hull.band_m))
+    whole = Hull(hull.voxel_m, hull.index_min, sdf, hull.band_m, hull.cameras, hull.rejected)
+    return Hull.from_shell(hull.voxel_m, hull.band_m, *whole.shell(), hull.cameras, hull.rejected)
 
 
 def carve(masks: Mapping[str, NDArray[np.uint8]], rig: Rig, config: HullConfig) -> Hull | NoPerson:
-    """Carve the hull of one frame.
+    """Carve the hull of one frame (paper section 1).
 
     Args:
         masks: camera name -> uint8 [height, width], non-zero = foreground. Cameras without a mask are left out.
@@ -67,5 +247,8 @@ def carve(masks: Mapping[str, NDArray[np.uint8]], rig: Rig, config: HullConfig) 
 
     Returns:
         the hull, cropped to its largest component plus the shell, or why there is none.
+
+    Raises:
+        InputError: a mask has not its camera's size, or its camera is unknown.
     """
-    raise NotImplementedError
+    return carve_silhouettes(measure_silhouettes(masks, rig, pack_cameras(rig), config), rig, config)
