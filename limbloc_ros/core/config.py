@@ -41,23 +41,59 @@ class BackgroundConfig:
     """Running Gaussian average segmentation (paper section 1, after Wren et al. 1997)."""
 
     learning_frames: int = setting(15, "person-free frames that make the first background", low=1, high=10_000)
-    learning_rate: float = setting(0.01, "weight of a new background pixel", low=0.0, high=1.0, live=True)
+    learning_rate: float = setting(
+        0.01, "weight of a new background pixel (0: the background stays as learned)", low=0.0, high=1.0, live=True
+    )
     threshold_sigmas: float = setting(
         4.0, "a pixel further than this from its mean is foreground", unit="sigma", low=0.5, high=50.0, live=True
     )
     sigma_floor: float = setting(
-        4.0, "smallest standard deviation of a channel", unit="grey levels", low=0.1, high=64.0, live=True
+        2.0, "standard deviation added to every pixel's own", unit="grey levels", low=0.1, high=64.0, live=True
     )
     shadow_darkest: float = setting(
         0.5, "a pixel darker than this fraction of its background is no shadow", low=0.0, high=1.0, live=True
     )
-    shadow_chroma: float = setting(
-        0.06, "largest chromaticity change that still counts as shadow", low=0.0, high=1.0, live=True
+    highlight_brightest: float = setting(
+        1.05, "a pixel brighter than this multiple of its background is no reflected light", low=1.0, high=3.0, live=True
     )
-    open_px: int = setting(1, "radius of the morphological opening (removes specks)", unit="px", low=0, high=20, live=True)
-    close_px: int = setting(3, "radius of the morphological closing (fills cracks)", unit="px", low=0, high=50, live=True)
-    min_blob_px: int = setting(150, "smaller foreground blobs are dropped", unit="px", low=0, high=1_000_000, live=True)
-    max_hole_px: int = setting(200, "smaller holes in the foreground are filled", unit="px", low=0, high=1_000_000, live=True)
+    shadow_sigmas: float = setting(
+        2.0,
+        "a darker pixel whose colour differs by less than this from its background's is shadow; every foreground blob "
+        "must somewhere reach twice this",
+        unit="sigma",
+        low=0.0,
+        high=50.0,
+        live=True,
+    )
+    edge_fraction: float = setting(
+        0.5,
+        "the outline runs where the change falls below this fraction of the change just inside (0: no trimming)",
+        low=0.0,
+        high=0.95,
+        live=True,
+    )
+    open_px: int = setting(
+        0, "radius of the morphological opening (removes thin things)", unit="px at 640x480", low=0, high=20, live=True
+    )
+    close_px: int = setting(
+        2, "radius of the morphological closing (fills cracks)", unit="px at 640x480", low=0, high=50, live=True
+    )
+    min_blob_px: int = setting(
+        150, "smaller foreground blobs are dropped", unit="px at 640x480", low=0, high=1_000_000, live=True
+    )
+    max_hole_px: int = setting(
+        100, "smaller holes in the foreground are filled", unit="px at 640x480", low=0, high=1_000_000, live=True
+    )
+    relearn_fraction: float = setting(
+        0.6,
+        "when more of the image than this changes, the light was switched: no mask, the background is learned anew",
+        low=0.05,
+        high=1.0,
+        live=True,
+    )
+    max_pixels: int = setting(
+        700_000, "larger images are halved until they have no more pixels than this", unit="px", low=10_000, high=100_000_000
+    )
 
 
 @dataclass(frozen=True)

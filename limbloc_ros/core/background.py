@@ -1,0 +1,492 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Images of one camera -> foreground masks: running Gaussian average (paper section 1, after Wren et al. 1997).
+
+Every pixel has a mean and a variance per channel; a pixel far from its mean is foreground and teaches the model
+nothing. Around this core, because real rooms need it:
+
+* the light's slow drift is one gain per channel and frame, taken from the background itself;
+* a shadow darkens a pixel and leaves its colour, so only what a factor `shadow_darkest .. highlight_brightest` on the
+  background cannot explain counts as foreground (Horprasert et al. 1999);
+* hysteresis: a weakly changed pixel counts when it hangs together with a strongly changed one;
+* the outline is put where the change falls to half of its value just inside, which undoes the blur of lens and codec;
+* when most of the image changes at once, the light was switched: no mask, and the background is learned anew.
+
+A mask depends on the images given before and on nothing else.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from limbloc_ros.core._background_kernels import (
+    CHANGE_SCALE,
+    COLOUR_SCALE,
+    densest_mean,
+    grow_from_seeds,
+    light_gain,
+    measure_and_update,
+)
+from limbloc_ros.core.config import BackgroundConfig, validated
+from limbloc_ros.core.errors import InputError
+
+Bytes = NDArray[np.uint8]
+Floats = NDArray[np.float32]
+
+REFERENCE_PIXELS = 640 * 480
+"""Sizes in the configuration are meant for images of this many pixels."""
+
+PATIENCE = 3
+"""Frames in a row that must disagree with the whole background before it is learned anew (a flash is shorter)."""
+
+_OUTLINE = np.ones((5, 5), dtype=np.uint8)
+_GRADIENT_BINS = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, float("inf"))
+
+
+@dataclass(frozen=True)
+class Segmentation:
+    """The mask of one image and what the model thinks of it.
+
+    Attributes:
+        mask: uint8 [H, W] of the image's size, 0 = background, 255 = foreground; all 0 while learning.
+        learning: the background is not known (yet, or again); the mask says nothing.
+        frames_learned: images that made the background so far.
+        foreground_fraction: part of the image that is foreground, 0 to 1.
+        light_jump: most of the image differs from the background: the light was switched or the camera moved.
+        gain: [3] brightness of the light relative to the learned background, per channel.
+    """
+
+    mask: Bytes
+    learning: bool
+    frames_learned: int
+    foreground_fraction: float
+    light_jump: bool
+    gain: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class BackgroundEstimate:
+    """A background guessed from a recording that shows a person all the time.
+
+    Attributes:
+        mean: float32 [H, W, 3], grey levels.
+        sigma: float32 [H, W, 3] noise, grey levels; 0 where the video repeats itself exactly.
+    """
+
+    mean: Floats
+    sigma: Floats
+
+
+class BackgroundModel:
+    """The background of one camera. Give it every image in order; it is not thread-safe."""
+
+    def __init__(self, config: BackgroundConfig | None = None) -> None:
+        """Start without a background: the first `config.learning_frames` images must be free of people.
+
+        Raises:
+            ConfigError: a value is out of its bounds.
+        """
+        self._config = validated(config or BackgroundConfig())
+        self._image_shape: tuple[int, ...] | None = None
+        self._grey = False
+        self._frozen = False
+        self._forget()
+
+    def _forget(self) -> None:
+        self._mean = np.zeros((3, 0, 0), dtype=np.float32)
+        self._variance = self._mean.copy()
+        self._gain = np.ones(3, dtype=np.float32)
+        self._busy = np.zeros((0, 0), dtype=np.uint8)
+        self._learned = 0
+        self._ready = False
+        self._noise_known = False
+        self._upset = 0
+
+    @property
+    def config(self) -> BackgroundConfig:
+        """The parameters in use; assign to change them between two images."""
+        return self._config
+
+    @config.setter
+    def config(self, config: BackgroundConfig) -> None:
+        if config.max_pixels != self._config.max_pixels:
+            self.recapture()
+        self._config = validated(config)
+
+    @property
+    def learning(self) -> bool:
+        """Whether the background is still unknown."""
+        return not self._ready
+
+    @property
+    def frozen(self) -> bool:
+        """Whether the background is kept as it is."""
+        return self._frozen
+
+    @property
+    def background(self) -> Bytes | None:
+        """uint8 [h, w, 3] the learned background at working size, or None before the first image."""
+        if self._learned == 0:
+            return None
+        return np.clip(np.rint(self._mean), 0, 255).astype(np.uint8).transpose(1, 2, 0)
+
+    def freeze(self, on: bool = True) -> None:
+        """Stop (or resume) learning from background pixels. The gain of the light is still followed."""
+        self._frozen = on
+
+    def recapture(self) -> None:
+        """Forget the background; the next `learning_frames` images must be free of people. Any size is accepted."""
+        self._forget()
+        self._image_shape = None
+
+    def seed(self, images: Bytes | Sequence[Bytes]) -> None:
+        """Start from pictures of the empty room instead of learning it.
+
+        Args:
+            images: one or more uint8 [H, W, 3] or [H, W] of the size of the images to come. With fewer than five,
+                the noise is estimated from the first image that is segmented.
+
+        Raises:
+            InputError: no picture, wrong type or unequal sizes.
+        """
+        pictures = [images] if isinstance(images, np.ndarray) else list(images)
+        if not pictures:
+            raise InputError("expected at least one background picture, got none; pass pictures of the empty room")
+        self.recapture()
+        for picture in pictures:
+            self._learn(self._working(picture))
+        self._finish_learning()
+
+    def seed_estimate(self, estimate: BackgroundEstimate) -> None:
+        """Start from `estimate_background`; its noise is a lower bound, the rest comes from the first image."""
+        self.recapture()
+        planes = self._working(np.clip(np.rint(estimate.mean), 0, 255).astype(np.uint8))
+        size = (planes.shape[2], planes.shape[1])
+        for c in range(3):
+            mean, sigma = (np.ascontiguousarray(a[..., c], dtype=np.float32) for a in (estimate.mean, estimate.sigma))
+            planes_c = (mean, sigma * sigma)
+            if mean.shape != planes.shape[1:]:
+                planes_c = (
+                    cv2.resize(mean, size, interpolation=cv2.INTER_AREA),
+                    cv2.resize(sigma * sigma, size, interpolation=cv2.INTER_AREA),
+                )
+            self._allocate(planes) if c == 0 else None
+            self._mean[c], self._variance[c] = planes_c
+        self._learned = 1
+        self._ready = True
+
+    def segment(self, image: Bytes) -> Segmentation:
+        """Segment the next image of this camera.
+
+        Args:
+            image: uint8 [H, W, 3] (any fixed channel order) or [H, W]. Grey images, also those stored with three
+                equal channels, carry no colour to tell a shadow by: shadows stay foreground.
+
+        Returns:
+            the mask and the state of the model.
+
+        Raises:
+            InputError: not an 8-bit image, or another size than before (`recapture` accepts a new size).
+        """
+        planes = self._working(image)
+        if not self._ready:
+            self._learn(planes)
+            if self._learned >= self._config.learning_frames:
+                self._finish_learning()
+            return self._no_mask(light_jump=False)
+        self._gain = light_gain(planes, self._mean, self._busy, self._gain, self._stride())
+        if not self._noise_known:
+            self._estimate_noise(planes)
+        change, colour = self._measure(planes)
+        threshold = int(round(self._config.threshold_sigmas * CHANGE_SCALE))
+        changed = cv2.medianBlur(change, 3)
+        if np.count_nonzero(changed >= threshold) > self._config.relearn_fraction * changed.size:
+            return self._light_jumped(planes)
+        self._upset = 0
+        mask = self._clean(change, changed, colour, threshold)
+        self._busy = cv2.dilate(mask, _OUTLINE)
+        fraction = cv2.countNonZero(mask) / mask.size
+        return Segmentation(self._full_size(mask), False, self._learned, fraction, False, self._gain_tuple())
+
+    def _working(self, image: Bytes) -> Bytes:
+        """Check an image and bring it to planar [3, h, w] at working size."""
+        if not isinstance(image, np.ndarray) or image.dtype != np.uint8:
+            kind = getattr(image, "dtype", type(image).__name__)
+            raise InputError(f"expected an image as uint8 array, got {kind}; convert it to 8 bits per channel first")
+        if image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3) or min(image.shape[:2]) < 16:
+            raise InputError(
+                f"expected an image [H, W, 3] or [H, W] of at least 16x16 px, got an array of shape {image.shape}; "
+                "drop the alpha channel or convert the image first"
+            )
+        if self._image_shape is None:
+            self._image_shape = image.shape[:2]
+            sample = image[::4, ::4].astype(np.int16)
+            self._grey = image.ndim == 2 or bool((np.ptp(sample, axis=2) <= 2).all())
+        elif image.shape[:2] != self._image_shape:
+            height, width = self._image_shape
+            raise InputError(
+                f"expected images of {width}x{height} px like the background, got {image.shape[1]}x{image.shape[0]}; "
+                "give every camera its own model, or capture the background anew after changing the resolution"
+            )
+        if image.ndim == 2:
+            image = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
+        height, width = image.shape[:2]
+        factor = 1
+        while (height // factor) * (width // factor) > self._config.max_pixels:
+            factor *= 2
+        if factor > 1:
+            image = cv2.resize(image, (width // factor, height // factor), interpolation=cv2.INTER_AREA)
+        planes = np.empty((3, *image.shape[:2]), dtype=np.uint8)
+        cv2.split(image, [planes[0], planes[1], planes[2]])
+        return planes
+
+    def _full_size(self, mask: Bytes) -> Bytes:
+        assert self._image_shape is not None
+        height, width = self._image_shape
+        if mask.shape == (height, width):
+            return mask
+        smooth = cv2.resize(mask, (width, height), interpolation=cv2.INTER_LINEAR)
+        return cv2.threshold(smooth, 127, 255, cv2.THRESH_BINARY)[1]
+
+    def _stride(self) -> int:
+        """Sampling of the gain: about 5000 pixels whatever the image's size."""
+        return max(1, int(np.sqrt(self._busy.size / 5000.0)))
+
+    def _gain_tuple(self) -> tuple[float, float, float]:
+        return float(self._gain[0]), float(self._gain[1]), float(self._gain[2])
+
+    def _no_mask(self, light_jump: bool) -> Segmentation:
+        assert self._image_shape is not None
+        mask = np.zeros(self._image_shape, dtype=np.uint8)
+        return Segmentation(mask, True, self._learned, 0.0, light_jump, self._gain_tuple())
+
+    def _allocate(self, planes: Bytes) -> None:
+        self._mean = planes.astype(np.float32)
+        self._variance = np.zeros_like(self._mean)
+        self._busy = np.zeros(planes.shape[1:], dtype=np.uint8)
+        self._learned = 1
+
+    def _learn(self, planes: Bytes) -> None:
+        """Add one person-free image: running mean and sum of squares (Welford) under the first image's light."""
+        if self._learned == 0:
+            self._allocate(planes)
+            return
+        gain = light_gain(planes, self._mean, self._busy, np.ones(3, dtype=np.float32), self._stride())
+        self._learned += 1
+        now = planes.astype(np.float32) / gain[:, None, None]
+        before = now - self._mean
+        self._mean += before / np.float32(self._learned)
+        self._variance += before * (now - self._mean)
+
+    def _finish_learning(self) -> None:
+        self._ready = True
+        self._noise_known = self._learned >= 5
+        if self._noise_known:
+            # A variance from a few frames is itself noisy; neighbours share their camera's noise.
+            for c in range(3):
+                self._variance[c] = cv2.blur(self._variance[c] / np.float32(self._learned - 1), (5, 5))
+
+    def _estimate_noise(self, planes: Bytes) -> None:
+        """Take each pixel's noise from how much pixels of equal background contrast differ from the background.
+
+        At edges of the background a tremble of the camera or the codec makes more noise than on plain walls. The
+        median is not disturbed by a person, who covers less than half of each class.
+        """
+        grey = self._mean.mean(axis=0)
+        slope = np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0, scale=0.125), cv2.Sobel(grey, cv2.CV_32F, 0, 1, scale=0.125))
+        slope = cv2.dilate(slope, np.ones((3, 3), dtype=np.uint8))
+        off = np.abs(planes.astype(np.float32) - self._mean * self._gain[:, None, None])
+        for low, high in zip(_GRADIENT_BINS[:-1], _GRADIENT_BINS[1:], strict=True):
+            where = (slope >= low) & (slope < high)
+            if np.count_nonzero(where) < 100:
+                where = slope >= low if low > 0 else np.ones_like(where)
+            for c in range(3):
+                sigma = 1.4826 * float(np.median(off[c][where])) if where.any() else 0.0
+                here = (slope >= low) & (slope < high)
+                self._variance[c][here] = np.maximum(self._variance[c][here], np.float32(sigma * sigma))
+        self._noise_known = True
+
+    def _measure(self, planes: Bytes) -> tuple[Bytes, Bytes]:
+        config = self._config
+        change = np.empty(planes.shape[1:], dtype=np.uint8)
+        colour = np.empty_like(change)
+        no_shadow = self._grey
+        measure_and_update(
+            planes,
+            self._mean,
+            self._variance,
+            self._busy,
+            self._gain,
+            np.float32(config.sigma_floor**2),
+            np.float32(1 / 3 if self._grey else 1),
+            np.float32(1 if no_shadow else config.shadow_darkest),
+            np.float32(1 if no_shadow else config.highlight_brightest),
+            np.float32(config.threshold_sigmas),
+            np.float32(0 if self._frozen else config.learning_rate),
+            change,
+            colour,
+        )
+        return change, colour
+
+    def _light_jumped(self, planes: Bytes) -> Segmentation:
+        self._upset += 1
+        if self._upset >= PATIENCE and not self._frozen:
+            self._forget()
+            self._learn(planes)
+            if self._learned >= self._config.learning_frames:
+                self._finish_learning()
+        return self._no_mask(light_jump=True)
+
+    def _clean(self, change: Bytes, changed: Bytes, colour: Bytes, threshold: int) -> Bytes:
+        """Distances of every pixel -> mask at working size.
+
+        Args:
+            change, changed: distance to the background, as measured and median filtered, in sigmas * CHANGE_SCALE.
+            colour: the part that no shadow explains, in sigmas * COLOUR_SCALE.
+            threshold: of `changed`.
+        """
+        config = self._config
+        scale = np.sqrt(change.size / REFERENCE_PIXELS)
+        blob, hole = config.min_blob_px * scale**2, config.max_hole_px * scale**2
+        colour = cv2.medianBlur(colour, 3)
+        weak_colour = int(round(config.shadow_sigmas * COLOUR_SCALE))
+        weak = cv2.bitwise_and(_at_least(changed, threshold), _at_least(colour, weak_colour))
+        strong = cv2.bitwise_and(weak, _at_least(colour, min(2 * weak_colour, 255)))
+        weak[[0, -1], :] = 0
+        weak[:, [0, -1]] = 0
+        full = grow_from_seeds(weak, strong)
+        # The outermost pixels cannot be judged by their neighbours: they follow the next ones.
+        _drop_blobs(full, blob / 2)
+        x, y, w, h = cv2.boundingRect(full)
+        if w == 0:
+            return full
+        pad = 8 + int(2 * config.close_px * scale)
+        rows = slice(max(y - pad, 0), y + h + pad)
+        columns = slice(max(x - pad, 0), x + w + pad)
+        mask = np.ascontiguousarray(full[rows, columns])
+        change, changed = np.ascontiguousarray(change[rows, columns]), changed[rows, columns]
+        mask = _morph(mask, cv2.MORPH_OPEN, config.open_px * scale)
+        mask = _morph(mask, cv2.MORPH_CLOSE, config.close_px * scale)
+        _fill_holes(mask, changed, threshold, hole)
+        if config.edge_fraction > 0:
+            mask = _trim_outline(mask, change, config.edge_fraction)
+            mask = _morph(mask, cv2.MORPH_CLOSE, 1.0)
+        _drop_blobs(mask, blob)
+        _fill_holes(mask, changed, threshold, hole)
+        full[rows, columns] = mask
+        full[0], full[-1] = full[1], full[-2]
+        full[:, 0], full[:, -1] = full[:, 1], full[:, -2]
+        return full
+
+
+def estimate_background(frames: Iterable[Bytes], share: float = 0.4) -> BackgroundEstimate:
+    """Guess the empty room from frames in which a person is always somewhere.
+
+    Each pixel takes the mean of the tightest brightness interval that holds `share` of its samples (a mode), after
+    the frames were brought to one light.
+
+    Limitation: a person (or a part: feet, a torso that hardly moves) who covers a pixel for more than about half of
+    the recording becomes background there, and is missing from every mask: use frames spread over the whole
+    recording, 15 to 60 of them, and prefer a picture of the empty room when there is one.
+
+    Args:
+        frames: uint8 [H, W, 3] or [H, W] of one camera.
+        share: part of the samples that the interval must hold, 0 to 1.
+
+    Raises:
+        InputError: fewer than three frames, or unequal sizes.
+    """
+    stack = [cv2.cvtColor(f, cv2.COLOR_GRAY2BGR) if f.ndim == 2 else f for f in frames]
+    if len(stack) < 3:
+        raise InputError(f"expected at least 3 frames to guess a background from, got {len(stack)}; use more frames")
+    shapes = {f.shape for f in stack}
+    if len(shapes) > 1:
+        raise InputError(f"expected frames of one size, got {sorted(shapes)}; each camera needs its own background")
+    samples = np.stack(stack)
+    spread = samples[np.linspace(0, len(samples) - 1, min(len(samples), 9)).round().astype(int)]
+    middle = np.ascontiguousarray(np.median(spread, axis=0).astype(np.float32).transpose(2, 0, 1))
+    nobody = np.zeros(middle.shape[1:], dtype=np.uint8)
+    ones = np.ones(3, dtype=np.float32)
+    gains = np.stack(
+        [light_gain(np.ascontiguousarray(f.transpose(2, 0, 1)), middle, nobody, ones, 4) for f in samples]
+    )
+    mean, sigma = densest_mean(samples, gains, share)
+    return BackgroundEstimate(mean, sigma)
+
+
+def warm_up() -> None:
+    """Compile or load the kernels, so that the first image is not slow."""
+    config = dataclasses.replace(BackgroundConfig(), learning_frames=2, relearn_fraction=1.0)
+    model = BackgroundModel(config)
+    image = np.full((32, 32, 3), 100, dtype=np.uint8)
+    for _ in range(3):
+        model.segment(image)
+    estimate_background([image] * 3)
+
+
+def _at_least(levels: Bytes, threshold: int) -> Bytes:
+    """255 where `levels` >= threshold."""
+    return cv2.threshold(levels, max(threshold - 1, 0), 255, cv2.THRESH_BINARY)[1]
+
+
+def _morph(mask: Bytes, operation: int, radius: float) -> Bytes:
+    size = 2 * int(round(radius)) + 1
+    if size == 1:
+        return mask
+    return cv2.morphologyEx(mask, operation, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)))
+
+
+def _drop_blobs(mask: Bytes, area: float) -> None:
+    """Erase, in place, outer outlines that enclose less than `area` px."""
+    contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    small = [c for c in contours if _enclosed(c) < area]
+    if small:
+        cv2.drawContours(mask, small, -1, 0, cv2.FILLED)
+
+
+def _enclosed(contour: NDArray[np.int32]) -> float:
+    """Pixels inside a closed outline including its own (Pick's theorem)."""
+    return cv2.contourArea(contour) + len(contour) / 2 + 1
+
+
+def _fill_holes(mask: Bytes, changed: Bytes, threshold: int, area: float) -> None:
+    """Fill, in place, holes that are small, or that are mostly changed and only look like shadow.
+
+    A true hole, seen between arm and trunk, shows the background itself; a hole that is merely the background's
+    colour under less light is more likely cloth.
+    """
+    contours, hierarchy = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+    if hierarchy is None:
+        return
+    fill = []
+    for contour, links in zip(contours, hierarchy[0], strict=True):
+        if links[3] < 0:
+            continue
+        # A hole's outline runs on the foreground around it.
+        if cv2.contourArea(contour) - len(contour) / 2 + 1 < area:
+            fill.append(contour)
+            continue
+        x, y, w, h = cv2.boundingRect(contour)
+        inside = np.zeros((h, w), dtype=np.uint8)
+        cv2.drawContours(inside, [contour - (x, y)], -1, 255, cv2.FILLED)
+        hole = (inside > 0) & (mask[y : y + h, x : x + w] == 0)
+        if 2 * np.count_nonzero(hole & (changed[y : y + h, x : x + w] >= threshold)) > np.count_nonzero(hole):
+            fill.append(contour)
+    if fill:
+        cv2.drawContours(mask, fill, -1, 255, cv2.FILLED)
+
+
+def _trim_outline(mask: Bytes, change: Bytes, fraction: float) -> Bytes:
+    """Drop outline pixels whose change is below `fraction` of the largest one within two pixels.
+
+    Blur spreads a person by a pixel or two; the true outline is where the change has half its inner value.
+    """
+    inner = cv2.dilate(cv2.bitwise_and(change, mask), _OUTLINE)
+    core = cv2.erode(mask, _OUTLINE)
+    enough = cv2.compare(change, cv2.convertScaleAbs(inner, alpha=fraction), cv2.CMP_GE)
+    return cv2.bitwise_and(mask, cv2.bitwise_or(core, enough))
