@@ -72,6 +72,7 @@ def overlay_montage(
     *,
     columns: int = 0,
     panel_width_px: int = 480,
+    close_up: bool = False,
 ) -> Image:
     """All cameras' images of one frame, with the figure over each, side by side.
 
@@ -82,6 +83,7 @@ def overlay_montage(
         flesh: drawn beneath the sticks when given.
         columns: panels in a row; 0 chooses.
         panel_width_px: width of a panel.
+        close_up: show only the part of each image around the person, upright 3:4, instead of the whole image.
 
     Returns:
         uint8 bgr.
@@ -98,8 +100,14 @@ def overlay_montage(
         if flesh is not None:
             picture = draw_flesh(picture, camera, flesh)
         picture = draw_stick(picture, camera, joints)
-        height = round(panel_width_px * camera.height / camera.width)
-        panels.append(label(cv2.resize(picture, (panel_width_px, height), interpolation=cv2.INTER_AREA), camera.name))
+        if close_up:
+            picture = _around_person(picture, camera, joints)
+        height = round(panel_width_px * picture.shape[0] / picture.shape[1])
+        shrinks = picture.shape[1] > panel_width_px
+        picture = cv2.resize(
+            picture, (panel_width_px, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC
+        )
+        panels.append(label(picture, camera.name))
     columns = columns or min(len(panels), 4 if len(panels) > 4 else 2)
     tallest, gap = max(p.shape[0] for p in panels), 6
     rows = -(-len(panels) // columns)
@@ -108,6 +116,26 @@ def overlay_montage(
         y, x = (k // columns) * (tallest + gap), (k % columns) * (panel_width_px + gap)
         sheet[y : y + panel.shape[0], x : x + panel_width_px] = panel
     return sheet
+
+
+def _around_person(picture: Image, camera: Camera, joints: Array) -> Image:
+    """The part of the picture that shows the joints, 3 wide and 4 high; dark where it reaches over the edge."""
+    uv, _ = camera.world_to_image(joints)
+    uv = uv[np.isfinite(uv).all(axis=1)]
+    inside = uv[((uv > -camera.width) & (uv < 2 * camera.width)).all(axis=1)]
+    if not len(inside):
+        return picture
+    low, high = inside.min(axis=0), inside.max(axis=0)
+    height = max(1.25 * (high[1] - low[1]), 1.35 * (high[0] - low[0]) * 4 / 3, 48.0)
+    size = (round(height * 3 / 4), round(height))
+    centre = (low + high) / 2
+    patch = np.full((size[1], size[0], 3), 38, dtype=np.uint8)
+    x0, y0 = (round(float(c) - n / 2) for c, n in zip(centre, size, strict=True))
+    left, top = max(x0, 0), max(y0, 0)
+    right, bottom = min(x0 + size[0], camera.width), min(y0 + size[1], camera.height)
+    if right > left and bottom > top:
+        patch[top - y0 : bottom - y0, left - x0 : right - x0] = picture[top:bottom, left:right]
+    return patch
 
 
 def as_bgr(image: Image) -> Image:

@@ -25,7 +25,8 @@ from limbloc_ros.report.mesh import (
     with_field,
 )
 from limbloc_ros.report.renderer import Layer, Picture, look_at, render
-from limbloc_ros.report.run import RunData, Sample
+from limbloc_ros.report.run import RunData
+from limbloc_ros.report.samples import Sample
 
 PANEL_PX = (400, 540)
 FIELD_OF_VIEW_RAD = 0.45
@@ -92,7 +93,7 @@ def glass(hull: Mesh) -> Layer:
 def caption(run: RunData, sample: Sample) -> str:
     """Frame, time and energy of a sample."""
     time = f"{run.seconds[sample.frame_index]:.2f} s, " if run.consecutive else ""
-    return f"frame {sample.frame_index}\n{time}energy {sample.pose.energy:.2f}"
+    return f"frame {sample.frame_index}, {time}energy {sample.pose.energy:.2f}"
 
 
 def stick_over_hull(run: RunData, samples: Sequence[Sample]) -> Figure:
@@ -117,7 +118,7 @@ def geodesic_sheet(run: RunData, samples: Sequence[Sample]) -> Figure:
     top = float(np.ceil(max(np.nanmax(f) for f in fields) * 10) / 10)
 
     def colours(distance: Array) -> Array:
-        near_line = np.abs(distance / ISOLINE_M - np.round(distance / ISOLINE_M)) < 0.06
+        near_line = np.abs(distance / ISOLINE_M - np.round(distance / ISOLINE_M)) < 0.035
         return np.asarray(GEODESIC_MAP(distance / top)[:, :3] * np.where(near_line, 0.55, 1.0)[:, None])
 
     return _field_sheet(
@@ -163,7 +164,7 @@ def normals_sheet(run: RunData, samples: Sequence[Sample]) -> Figure:
 
     def layers(sample: Sample, hull: Mesh) -> list[Layer]:
         surface = sample.surface
-        return [Layer(hull), Layer(needles(surface.points[::6], surface.normals[::6]))]
+        return [Layer(hull), Layer(needles(surface.points[::6], surface.normals[::6]), outlined=False)]
 
     return sheet(panels(samples, layers), [f"frame {s.frame_index}" for s in samples], columns=len(samples))
 
@@ -186,7 +187,7 @@ def sheet(
     columns: int,
     colour_bar: tuple[Colormap, float, float, str] | None = None,
 ) -> Figure:
-    """Pictures of one size in rows, each pixel kept, a caption within each and a colour bar below.
+    """Pictures of one size in rows, each pixel kept, a caption below each and a colour bar at the foot.
 
     Args:
         pictures: uint8 rgb, at least one.
@@ -197,12 +198,12 @@ def sheet(
     columns = min(columns, len(pictures))
     rows = -(-len(pictures) // columns)
     height, width = pictures[0].shape[:2]
-    gap, foot = 8, 84 if colour_bar else 0
-    full_width, full_height = columns * (width + gap) - gap, rows * (height + gap) - gap + foot
+    gap, strip, foot = 8, 34, 76 if colour_bar else 0
+    full_width, full_height = columns * (width + gap) - gap, rows * (height + strip) + foot
     figure = Figure(figsize=(full_width / DPI, full_height / DPI), dpi=DPI, facecolor="white")
     FigureCanvasAgg(figure)
     for k, (picture, title) in enumerate(zip(pictures, titles, strict=True)):
-        x, y = (k % columns) * (width + gap), (k // columns) * (height + gap)
+        x, y = (k % columns) * (width + gap), (k // columns) * (height + strip)
         box = (x / full_width, 1 - (y + height) / full_height, width / full_width, height / full_height)
         axes = figure.add_axes(box)
         axes.imshow(picture, interpolation="none", aspect="auto")
@@ -213,7 +214,7 @@ def sheet(
     if colour_bar:
         colour_map, low, high, text = colour_bar
         bar_width = min(0.8, 640 / full_width)
-        axes = figure.add_axes((0.5 - bar_width / 2, 48 / full_height, bar_width, 16 / full_height))
+        axes = figure.add_axes((0.5 - bar_width / 2, 50 / full_height, bar_width, 16 / full_height))
         ramp = colour_map(np.linspace(0, 1, 256))[None, :, :3]
         axes.imshow(ramp, extent=(low, high, 0, 1), aspect="auto", interpolation="bilinear")
         axes.set_yticks([])

@@ -42,6 +42,7 @@ class Layer:
         edge_opacity: 0 to 1 where it is seen edge-on; None for the same as `opacity`. Glass has little and much.
         colour_map: scalars [N] -> sRGB [N, 3]; None takes the mesh's own colours.
         gloss: strength of the highlight.
+        outlined: draw a thin dark line where depth jumps.
     """
 
     mesh: Mesh
@@ -49,6 +50,7 @@ class Layer:
     edge_opacity: float | None = None
     colour_map: Callable[[NDArray[Any]], NDArray[Any]] | None = None
     gloss: float = 0.12
+    outlined: bool = True
 
 
 def look_at(
@@ -175,7 +177,7 @@ def _draw(layer: Layer, camera: Camera, smooth: int) -> tuple[FloatPicture, Floa
     rays[:, :2] = (at - camera.K[:2, 2]) / camera.K[[0, 1], [0, 1]]
     normals = here[:, :3] @ camera.T_world_camera[:3, :3].astype(np.float32)
     light, highlight, facing = _light(normals, rays, layer.gloss)
-    shade = light * _occlusion(z_buffer, seen, camera.K[0, 0] * smooth)[seen]
+    shade = light * _occlusion(z_buffer, seen, camera.K[0, 0] * smooth, layer.outlined)[seen]
     rgb[seen] = np.clip(colour, 0, 1) ** GAMMA * shade[:, None] + highlight[:, None]
     edge = layer.opacity if layer.edge_opacity is None else layer.edge_opacity
     alpha[seen] = layer.opacity + (edge - layer.opacity) * (1 - facing) ** 2
@@ -198,7 +200,7 @@ def _light(normals: FloatPicture, rays: FloatPicture, gloss: float) -> tuple[Flo
     return light, highlight, facing
 
 
-def _occlusion(z_buffer: FloatPicture, seen: NDArray[np.bool_], focal_px: float) -> FloatPicture:
+def _occlusion(z_buffer: FloatPicture, seen: NDArray[np.bool_], focal_px: float, outlined: bool) -> FloatPicture:
     """Light that reaches each pixel [H, W], 0 to 1: less in hollows, and a thin dark line where depth jumps.
 
     Depth is compared with its blurred self (Luft et al. 2006, "Image enhancement by unsharp masking the depth
@@ -210,6 +212,8 @@ def _occlusion(z_buffer: FloatPicture, seen: NDArray[np.bool_], focal_px: float)
     weight = cv2.GaussianBlur(seen.astype(np.float32), (0, 0), sigma)
     around = cv2.GaussianBlur(filled, (0, 0), sigma) / np.maximum(weight, 1e-6)
     hollow = np.clip((filled - around) / 0.12, 0, 1)
+    if not outlined:
+        return np.asarray(1 - 0.55 * hollow, dtype=np.float32)
     behind = cv2.dilate(np.where(seen, z_buffer, np.float32(near - 1)), np.ones((3, 3), np.uint8)) - filled
     line = np.where(seen & (behind > 0.04), np.float32(0.45), np.float32(0))
     return np.asarray((1 - 0.55 * hollow) * (1 - line), dtype=np.float32)

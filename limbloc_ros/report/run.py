@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a report is made from: the results of a run, and a few of its frames with hull and pose."""
+"""The results of a run as the report reads them: one array per quantity, NaN where a frame has no person."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,12 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from limbloc_ros import __version__
-from limbloc_ros.core.camera import Rig
 from limbloc_ros.core.errors import InputError
-from limbloc_ros.core.geodesic import geodesic_map
-from limbloc_ros.core.hull import Hull
 from limbloc_ros.core.pose import JOINT, JOINT_NAMES, STICK_BONES, Array, Pose
-from limbloc_ros.core.surface import Surface, extract_surface
+from limbloc_ros.recordings.results import FrameResult, Run
 
 #: The joints that the benchmark scores: the head and the limbs.
 LIMB_JOINTS = (
@@ -27,6 +24,8 @@ LIMB_JOINTS = (
 
 #: A step between consecutive frames is a jump when it is this many times the joint's usual one and at least so long.
 JUMP_RATIO, JUMP_M, JUMP_RAD = 5.0, 0.15, np.radians(40.0)
+#: A head that usually moves so far between frames belongs to unrelated poses, not to a movement, m.
+UNRELATED_M = 0.3
 
 
 @dataclass(frozen=True)
@@ -87,6 +86,56 @@ class RunData:
         for name, shape in shapes.items():
             if np.shape(values[name]) != shape:
                 raise InputError(f"{name}: expected shape {shape}, got {np.shape(values[name])}")
+
+    @staticmethod
+    def of(
+        run: Run,
+        *,
+        title: str,
+        source: str = "",
+        truth: Mapping[str, Array] | None = None,
+        command: str = "",
+        consecutive: bool | None = None,
+    ) -> RunData:
+        """The report's view of a recorded run.
+
+        Args:
+            run: the recorded results.
+            title: heading of the report.
+            source: what was processed, in words; by default what the run says.
+            truth: joint name -> [F, 3] true positions, m; empty or None when not known.
+            command: the command line that made the run; by default what the run says.
+            consecutive: whether the frames follow each other; by default judged by how far the head moves.
+        """
+        names, angles, joints = run.angle_names, run.angles, run.joints
+        about = flatten(run.about)
+        command = command or about.pop("command", "")
+        source = source or about.pop("input", "")
+        known = None
+        if truth:
+            nothing = np.full((len(run), 3), np.nan)
+            known = np.stack([np.asarray(truth.get(name, nothing), dtype=np.float64) for name in JOINT_NAMES], axis=1)
+        stages = list(dict.fromkeys(stage for frame in run.frames for stage in _stage_ms(frame)))
+        if consecutive is None:
+            head = steps(joints[:, JOINT["head_centre"]])
+            consecutive = not np.isfinite(head).any() or float(np.nanmedian(head)) < UNRELATED_M
+        return RunData(
+            title=title,
+            source=source,
+            joints=joints,
+            stamps=run.stamps,
+            energy=run.energy,
+            sigma=run.sigma,
+            reliable=run.reliable,
+            stage_ms={s: np.array([_stage_ms(f).get(s, np.nan) for f in run.frames]) for s in stages},
+            angles={name: angles[:, i] for i, name in enumerate(names)},
+            missing={i: reason for i, reason in enumerate(run.reasons) if reason},
+            truth=known,
+            settings=about,
+            command=command,
+            version=about.pop("version", __version__),
+            consecutive=consecutive,
+        )
 
     @property
     def found(self) -> NDArray[np.bool_]:
@@ -152,53 +201,19 @@ def joint_jumps(run: RunData) -> dict[str, NDArray[np.bool_]]:
     return {name: jumps(run.joint_path(name), JUMP_M) for name in JOINT_NAMES} if run.consecutive else {}
 
 
-@dataclass(frozen=True)
-class Sample:
-    """One frame of the run with everything that its pictures need.
-
-    Attributes:
-        frame_index: which frame.
-        hull: its visual hull.
-        surface: the hull's surface.
-        geodesic: [N] geodesic distance of each surface point from the centre of mass, m (inf where out of reach).
-        pose: the fitted pose.
-        anchors: points that the paper's engine went by, [3] m by name (`knee_L`, ...), for figs. 6 and 7.
-        images: camera name -> uint8 bgr [H, W, 3] image or [H, W] mask, for overlays; empty for none.
-        rig: the cameras of the images.
-    """
-
-    frame_index: int
-    hull: Hull
-    surface: Surface
-    geodesic: Array
-    pose: Pose
-    anchors: Mapping[str, Array] = field(default_factory=dict)
-    images: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)
-    rig: Rig | None = None
-
-    @staticmethod
-    def of(
-        frame_index: int,
-        hull: Hull,
-        pose: Pose,
-        *,
-        anchors: Mapping[str, Array] | None = None,
-        images: Mapping[str, NDArray[np.uint8]] | None = None,
-        rig: Rig | None = None,
-    ) -> Sample:
-        """A sample whose surface and geodesic map are worked out from the hull."""
-        surface = extract_surface(hull)
-        return Sample(frame_index, hull, surface, geodesic_map(hull, surface), pose, anchors or {}, images or {}, rig)
+def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
+    """Nested plain values as one table of texts: `{"hull": {"voxel_m": 0.02}}` -> `{"hull.voxel_m": "0.02"}`."""
+    table: dict[str, str] = {}
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            table |= flatten(value, f"{prefix}{name}.")
+        elif isinstance(value, (list, tuple)):
+            table[prefix + name] = ", ".join(str(v) for v in value)
+        else:
+            table[prefix + name] = str(value)
+    return table
 
 
-def choose_frames(found: Sequence[bool] | NDArray[np.bool_], count: int = 6) -> list[int]:
-    """Up to `count` frames with a person, spread evenly over the run, in order.
-
-    Args:
-        found: [F] which frames have a person.
-        count: how many to choose, at least 1.
-    """
-    frames = np.flatnonzero(found)
-    if len(frames) <= count:
-        return [int(f) for f in frames]
-    return [int(frames[round(k)]) for k in np.linspace(0, len(frames) - 1, 2 * count + 1)[1::2]]
+def _stage_ms(frame: FrameResult) -> dict[str, float]:
+    """Times of all stages of a frame, before the pose and within it."""
+    return {**frame.stage_ms, **(frame.outcome.stage_ms if isinstance(frame.outcome, Pose) else {})}
