@@ -12,7 +12,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import CompressedImage, Image
 from std_srvs.srv import SetBool, Trigger
 
-from limbloc_ros.core.background import BackgroundModel, Segmentation
+from limbloc_ros.core.background import BackgroundModel, Segmentation, warm_up
 from limbloc_ros.core.config import BackgroundConfig, setting
 from limbloc_ros.ros import image_messages, node_main, topics
 from limbloc_ros.ros.health import Health, Meter
@@ -45,6 +45,7 @@ class SegmentationNode(Node):
         parameters = NodeParameters(self)
         self.settings = parameters.declare(SegmentationSettings)
         self.model = BackgroundModel(parameters.declare(BackgroundConfig, "background", self._on_config))
+        warm_up()
         self.last: Segmentation | None = None
         self.meter = Meter()
         camera = self.settings.camera
@@ -89,9 +90,13 @@ class SegmentationNode(Node):
         """Rate, latency, how much is foreground, and whether it still learns."""
         level, message, fill = OK, "segmenting", float("nan")
         if self.last is not None:
-            fill = 100.0 * float((self.last.mask != 0).mean())
-            if self.last.learning:
-                level, message = WARN, "learning the background: keep the room empty"
+            fill = 100.0 * self.last.foreground_fraction
+            wanted = self.model.config.learning_frames
+            if self.last.light_jump:
+                level, message = WARN, "most of the image changed at once: was the light switched or the camera moved?"
+            elif self.last.learning:
+                progress = f"{self.last.frames_learned} of {wanted} images"
+                level, message = WARN, f"learning the background ({progress}): keep the room empty"
         if self.meter.silence_s > SILENT_S:
             publishers = self.count_publishers(self.topic)
             why = "nobody publishes it" if publishers == 0 else f"{publishers} publisher(s), but no usable image came"
@@ -100,7 +105,8 @@ class SegmentationNode(Node):
             "rate_hz": self.meter.rate_hz,
             "latency_ms": self.meter.latency_ms,
             "mask_fill_percent": fill,
-            "learning": self.last is not None and self.last.learning,
+            "learning": self.model.learning,
+            "frozen": self.model.frozen,
         }
         return [make_status(f"{self.get_name()}: mask", level, message, values, self.settings.camera)]
 

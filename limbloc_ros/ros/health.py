@@ -19,7 +19,7 @@ from rclpy.node import Node
 
 from limbloc_ros.core.errors import LimblocError
 from limbloc_ros.ros import topics
-from limbloc_ros.ros.messages import ERROR, worst
+from limbloc_ros.ros.messages import ERROR, OK, worst
 
 PERIOD_S = 1.0
 #: Rates are counted over this long, and a fault is shown and not logged again for this long.
@@ -76,6 +76,7 @@ class Health:
         self._node = node
         self._describe = describe
         self._faults: dict[str, _Fault] = {}
+        self._levels: dict[str, bytes] = {}
         self._publisher = node.create_publisher(DiagnosticArray, topics.DIAGNOSTICS, topics.DIAGNOSTICS_QOS)
         self._timer = node.create_timer(PERIOD_S, self.publish, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
@@ -100,6 +101,8 @@ class Health:
     def publish(self) -> None:
         """Publish now (also called by the timer)."""
         statuses = list(self._describe())
+        for status in statuses:
+            self._log_change(status)
         now = time.monotonic()
         recent = {key: fault for key, fault in self._faults.items() if now - fault.seen < WINDOW_S}
         if recent:
@@ -113,6 +116,18 @@ class Health:
         msg = DiagnosticArray(status=statuses)
         msg.header.stamp = self._node.get_clock().now().to_msg()
         self._publisher.publish(msg)
+
+    def _log_change(self, status: DiagnosticStatus) -> None:
+        """Say it once when something becomes bad or good again; who watches only the console must see it too."""
+        before = self._levels.get(status.name, OK)
+        self._levels[status.name] = status.level
+        if status.level == before:
+            return
+        log = self._node.get_logger()
+        if status.level == OK:
+            log.info(f"{status.name} is fine again: {status.message}")
+        else:
+            log.warning(f"{status.name}: {status.message}")
 
     def latency_s(self, stamp_ns: int) -> float:
         """Seconds from an acquisition stamp to now on the node's clock."""

@@ -1,0 +1,146 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Masks of all cameras -> visual hull (paper section 1)."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from sensor_msgs.msg import CompressedImage, Image, PointCloud2
+
+from limbloc_ros.core.camera import Rig
+from limbloc_ros.core.config import HullConfig, SyncConfig, setting
+from limbloc_ros.core.errors import InputError, NoPerson
+from limbloc_ros.core.images import Pixels
+from limbloc_ros.core.pipeline import Carver
+from limbloc_ros.core.synchroniser import FrameSet, StampSynchroniser
+from limbloc_ros.ros import cloud_messages, image_messages, node_main, topics
+from limbloc_ros.ros.carving_report import CarvingReport
+from limbloc_ros.ros.health import Health
+from limbloc_ros.ros.messages import make_header, stamp_ns
+from limbloc_ros.ros.parameters import NodeParameters
+from limbloc_ros.ros.rig_source import RigFromTopics, rig_from_file
+
+#: How often waiting sets are looked at.
+TICK_S = 0.02
+
+
+@dataclass(frozen=True)
+class CarvingSettings:
+    """What only this node needs to know."""
+
+    rig_file: str = setting("", "rig file; empty: the cameras' CameraInfo and TF are used")
+    cameras: tuple[str, ...] = setting((), "the cameras that take part; empty: all of the rig file")
+    mask_transport: str = setting("compressed", "which mask topics are read", choices=("raw", "compressed"))
+    world_frame: str = setting("room", "TF frame of the world, in which the hull is published")
+    volume_min: tuple[float, ...] = setting((), "lower corner of the carve volume without a rig file", unit="m")
+    volume_max: tuple[float, ...] = setting((), "upper corner; both empty: what the cameras see", unit="m")
+
+
+class CarvingNode(Node):
+    """Synchronises masks, carves them, and publishes `hull`; an empty cloud when nobody is there."""
+
+    def __init__(self, node_name: str = "carving", **node_options: Any) -> None:
+        super().__init__(node_name, **node_options)
+        parameters = NodeParameters(self)
+        self.settings = parameters.declare(CarvingSettings)
+        self.hull_config = parameters.declare(HullConfig, "hull", self._on_hull_config)
+        self.sync_config = parameters.declare(SyncConfig, "sync", self._on_sync_config)
+        cloud_messages.check_voxel_size(self.hull_config.voxel_m, self.hull_config.band_m)
+        self.rig: Rig | None = None
+        self.carver: Carver | None = None
+        self.rig_source: RigFromTopics | None = None
+        self.synchroniser: StampSynchroniser[Pixels] | None = None
+        self.hull = self.create_publisher(PointCloud2, topics.HULL, topics.STREAM_QOS)
+        s = self.settings
+        if s.rig_file:
+            self.use_rig(rig_from_file(s.rig_file, s.cameras))
+        else:
+            volume = (s.volume_min, s.volume_max)
+            self.rig_source = RigFromTopics(
+                self, s.cameras, s.world_frame, volume, self.hull_config.min_cameras, self.use_rig
+            )
+        mask_topics = {name: self.mask_topic(name) for name in s.cameras or (self.rig.names if self.rig else ())}
+        self.report = CarvingReport(self, mask_topics)
+        self.health = Health(self, self.describe)
+        kind = Image if s.mask_transport == "raw" else CompressedImage
+        for name, topic in mask_topics.items():
+            self.create_subscription(kind, topic, self.make_callback(name), topics.MASK_QOS)
+        self.create_timer(TICK_S, self.on_tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def mask_topic(self, camera: str) -> str:
+        """Where a camera's masks come from."""
+        raw = self.settings.mask_transport == "raw"
+        return topics.mask(camera) if raw else topics.mask_compressed(camera)
+
+    def use_rig(self, rig: Rig) -> None:
+        """Carve with this rig from now on."""
+        self.rig = rig
+        self.carver = Carver(rig, self.hull_config)
+        self.synchroniser = StampSynchroniser.from_config(rig.names, self.sync_config, self.hull_config.min_cameras)
+        self.get_logger().info(f"carving with {len(rig.cameras)} cameras: {', '.join(rig.names)}")
+
+    def make_callback(self, camera: str) -> Callable[[Image | CompressedImage], None]:
+        """The subscription callback of one camera."""
+        return lambda msg: self.on_mask(camera, msg)
+
+    def on_mask(self, camera: str, msg: Image | CompressedImage) -> None:
+        """One mask: into the synchroniser; whatever sets are complete then are carved."""
+        if self.rig is None or self.synchroniser is None or camera not in self.rig.names:
+            return  # the diagnostics say what is missing of the rig
+        with self.health.guard(f"camera {camera}"):
+            mask = image_messages.message_to_mask(msg)
+            expected = self.rig.camera(camera)
+            if mask.shape != (expected.height, expected.width):
+                raise InputError(
+                    f"expected a mask of {expected.width}x{expected.height} px as in the rig, got "
+                    f"{mask.shape[1]}x{mask.shape[0]}; is the stream scaled, or the rig another camera's?"
+                )
+            stamp = stamp_ns(msg.header)
+            self.report.mask(camera, mask, self.health.latency_s(stamp))
+            self.carve(self.synchroniser.add(camera, stamp, mask, time.monotonic_ns()))
+
+    def on_tick(self) -> None:
+        """Let incomplete sets go when their time is up."""
+        if self.synchroniser is not None:
+            self.carve(self.synchroniser.tick(time.monotonic_ns()))
+
+    def carve(self, sets: Sequence[FrameSet[Pixels]]) -> None:
+        """Carve finished sets and publish one hull each."""
+        for frames in sets:
+            assert self.carver is not None
+            header = make_header(frames.stamp_ns, self.settings.world_frame)
+            started = time.thread_time()
+            with self.health.guard("carving"):
+                hull = self.carver.carve(frames.items)
+                if isinstance(hull, NoPerson):
+                    self.hull.publish(cloud_messages.empty_hull_cloud(header))
+                else:
+                    self.hull.publish(cloud_messages.hull_to_cloud(hull, header))
+                carve_ms = 1e3 * (time.thread_time() - started)
+                self.report.carved(frames, hull, carve_ms, self.health.latency_s(frames.stamp_ns))
+
+    def describe(self) -> Sequence[DiagnosticStatus]:
+        """The hull, and one entry per camera."""
+        return self.report.statuses(self.synchroniser, self.rig_source.problems if self.rig_source else {})
+
+    def _on_hull_config(self, config: HullConfig) -> None:
+        self.hull_config = config
+        if self.rig is not None and self.synchroniser is not None:
+            self.carver = Carver(self.rig, config)
+            self.synchroniser.min_cameras = config.min_cameras
+
+    def _on_sync_config(self, config: SyncConfig) -> None:
+        if self.synchroniser is not None:
+            self.synchroniser.slop_s, self.synchroniser.timeout_s = config.slop_s, config.timeout_s
+        self.sync_config = config
+
+
+def main() -> int:
+    """Run the carving node."""
+    return node_main.main(CarvingNode)

@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Hull -> posture: joints, joint angles, URDF, TF and pictures (paper section 2)."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import PoseArray
+from rclpy.node import Node
+from sensor_msgs.msg import JointState, PointCloud2
+from std_msgs.msg import Header
+from visualization_msgs.msg import MarkerArray
+
+from limbloc_ros.core.config import FitConfig, setting
+from limbloc_ros.core.errors import ConfigError, NoPerson
+from limbloc_ros.core.geodesic import geodesic_map
+from limbloc_ros.core.hull import Hull
+from limbloc_ros.core.pipeline import PoseEstimator
+from limbloc_ros.core.pose import Pose
+from limbloc_ros.core.surface import extract_surface
+from limbloc_ros.core.synchroniser import JUMP_S
+from limbloc_ros.ros import messages, node_main, topics
+from limbloc_ros.ros.body_output import BodyOutput
+from limbloc_ros.ros.cloud_messages import cloud_to_hull, surface_to_cloud
+from limbloc_ros.ros.health import Health, Meter
+from limbloc_ros.ros.messages import NANOSECONDS, OK, WARN, make_status, stamp_ns
+from limbloc_ros.ros.parameters import NodeParameters
+
+#: Longer without a hull is worth a warning.
+SILENT_S = 2.0
+
+
+@dataclass(frozen=True)
+class PoseSettings:
+    """What only this node needs to know."""
+
+    body_id: str = setting("p1", "id of the person in topics, joints and frames: letters and digits, a letter first")
+    world_frame: str = setting("room", "TF frame of the world")
+    publish_unreliable: bool = setting(
+        False, "publish angles and joints also when the fit should not be acted on", live=True
+    )
+    publish_tf: str = setting(
+        "all", "transforms: of all links, only of the body's root, or none", choices=("all", "root", "none")
+    )
+    urdf_tolerance_m: float = setting(
+        0.03, "a fitted length that changes by more gives a new URDF", unit="m", low=0.0, high=1.0, live=True
+    )
+    urdf_period_s: float = setting(
+        5.0, "but not more often than this, so that viewers need not reload", unit="s", low=0.0, high=3600.0, live=True
+    )
+
+
+class PoseNode(Node):
+    """Fits the figure to each hull. Every hull gives one message on `joints`, empty when there is no posture."""
+
+    def __init__(self, node_name: str = "pose", **node_options: Any) -> None:
+        super().__init__(node_name, **node_options)
+        parameters = NodeParameters(self)
+        self.settings = parameters.declare(PoseSettings, on_change=self._on_settings)
+        self.estimator = PoseEstimator(parameters.declare(FitConfig, "fit", self._on_fit_config))
+        if not re.fullmatch("[A-Za-z][A-Za-z0-9]*", self.settings.body_id):
+            raise ConfigError(
+                f"parameter body_id: expected letters and digits, a letter first, got {self.settings.body_id!r}"
+            )
+        self.outcome: Pose | NoPerson = NoPerson("no hull yet")
+        self.last_stamp_ns: int | None = None
+        self.meter = Meter()
+        self.joints = self.create_publisher(PoseArray, topics.JOINTS, topics.STREAM_QOS)
+        self.angles = self.create_publisher(JointState, topics.JOINT_ANGLES, topics.STREAM_QOS)
+        self.markers = self.create_publisher(MarkerArray, topics.MARKERS, topics.STREAM_QOS)
+        self.surface = self.create_publisher(PointCloud2, topics.SURFACE, topics.STREAM_QOS)
+        self.body = BodyOutput(self, self.settings.body_id, self.settings.publish_tf)
+        self.get_logger().info("loading the kernels; the first start compiles them, which may take a minute")
+        PoseEstimator.warm_up()
+        self.health = Health(self, self.describe)
+        self.create_subscription(PointCloud2, topics.HULL, self.on_hull, topics.NEWEST_QOS)
+        self.get_logger().info("ready")
+
+    def on_hull(self, msg: PointCloud2) -> None:
+        """One hull: fit the figure, publish everything with the hull's stamp."""
+        with self.health.guard("hull"):
+            stamp = stamp_ns(msg.header)
+            if self.last_stamp_ns is not None and stamp < self.last_stamp_ns - JUMP_S * NANOSECONDS:
+                self.estimator.reset()
+                self.body.reset()
+            self.last_stamp_ns = stamp
+            header = messages.make_header(stamp, self.settings.world_frame)
+            hull = cloud_to_hull(msg)
+            self.outcome = NoPerson("the hull is empty") if hull is None else self.estimator.estimate(hull)
+            self.publish_pose(self.outcome, header)
+            if hull is not None and self.surface.get_subscription_count():
+                self.publish_surface(hull, header)
+            self.meter.tick(self.health.latency_s(stamp))
+
+    def publish_pose(self, outcome: Pose | NoPerson, header: Header) -> None:
+        """The figure to look at always, numbers to act on only when they are reliable."""
+        if isinstance(outcome, NoPerson):
+            self.joints.publish(messages.joints_to_message(None, header))
+            self.markers.publish(messages.no_markers(header))
+            return
+        if outcome.reliable or self.settings.publish_unreliable:
+            self.joints.publish(messages.joints_to_message(outcome.joints, header))
+            self.angles.publish(messages.angles_to_message(outcome.angles, header))
+            self.body.publish(outcome, header, self.settings.urdf_tolerance_m, self.settings.urdf_period_s)
+        else:
+            self.joints.publish(messages.joints_to_message(None, header))
+        if self.markers.get_subscription_count():
+            self.markers.publish(messages.figure_to_markers(outcome, header))
+
+    def publish_surface(self, hull: Hull, header: Header) -> None:
+        """The pictures of figs. 1 and 4; only computed when somebody looks."""
+        surface = extract_surface(hull)
+        self.surface.publish(surface_to_cloud(surface, geodesic_map(hull, surface), header))
+
+    def describe(self) -> Sequence[DiagnosticStatus]:
+        """Rate, latency, XOR energy and the time of each stage."""
+        values: dict[str, Any] = {"rate_hz": self.meter.rate_hz, "latency_ms": self.meter.latency_ms}
+        if isinstance(self.outcome, NoPerson):
+            level, message = OK, f"no person: {self.outcome.reason}"
+        else:
+            level, message = OK, "tracking"
+            if not self.outcome.reliable:
+                level = WARN
+                message = (
+                    f"the fit is not reliable (XOR energy {self.outcome.energy:.2f}): no joint states are published"
+                )
+                if self.settings.publish_unreliable:
+                    message = f"the fit is not reliable (XOR energy {self.outcome.energy:.2f})"
+            values["xor_energy"] = float(self.outcome.energy)
+            values["reliable"] = self.outcome.reliable
+            values |= {f"{stage}_ms": float(ms) for stage, ms in self.outcome.stage_ms.items()}
+        if self.meter.silence_s > SILENT_S:
+            level, message = WARN, f"no hull for {self.meter.silence_s:.0f} s"
+        values["tf"] = self.body.tf_state
+        return [make_status(f"{self.get_name()}: posture", level, message, values, self.settings.body_id)]
+
+    def _on_settings(self, settings: PoseSettings) -> None:
+        self.settings = settings
+
+    def _on_fit_config(self, config: FitConfig) -> None:
+        self.estimator = PoseEstimator(config)
+
+
+def main() -> int:
+    """Run the pose node."""
+    return node_main.main(PoseNode)

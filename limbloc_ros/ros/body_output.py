@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A person as ROS4HRI wants it (REP-155): joint_states, a URDF with the fitted lengths, and TF."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+from rclpy.node import Node
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Header, String
+
+from limbloc_ros.core.joint_angles import ros4hri
+from limbloc_ros.core.pose import Pose
+from limbloc_ros.ros import topics
+from limbloc_ros.ros.messages import NANOSECONDS, angles_to_message, stamp_ns, transform_to_message
+from limbloc_ros.ros.transforms import TransformOutput, link_transforms
+from limbloc_ros.ros.urdf import body_urdf
+
+
+class BodyOutput:
+    """Publishes what belongs to `/humans/bodies/<id>`.
+
+    Args:
+        node: where the publishers live.
+        body_id: the person's id.
+        publish_tf: `all` links (then no robot_state_publisher is needed), only the `root`, or `none`.
+    """
+
+    def __init__(self, node: Node, body_id: str, publish_tf: str) -> None:
+        self._id = body_id
+        self._publish_tf = publish_tf
+        self._states = node.create_publisher(JointState, topics.body_joint_states(body_id), topics.STREAM_QOS)
+        self._urdf = node.create_publisher(String, topics.body_urdf(body_id), topics.LATCHED_QOS)
+        self._transforms = TransformOutput(node) if publish_tf != "none" else None
+        self._description = ""
+        self._sizes: Mapping[str, float] = {}
+        self._described_ns = 0
+        self._angles: dict[str, float] | None = None
+
+    @property
+    def tf_state(self) -> str:
+        """For the diagnostics."""
+        if self._transforms is None:
+            return "off"
+        return self._publish_tf if self._transforms.available else "off: tf2_ros is not installed"
+
+    def reset(self) -> None:
+        """Forget the last frame (a jump back in time)."""
+        self._angles, self._described_ns = None, 0
+
+    def publish(self, pose: Pose, header: Header, urdf_tolerance_m: float, urdf_period_s: float) -> None:
+        """Joint states and transforms of one frame, and the URDF when the sizes have changed notably."""
+        stamp = stamp_ns(header)
+        changed = max((abs(pose.sizes[k] - self._sizes.get(k, np.inf)) for k in pose.sizes), default=0.0)
+        waited = stamp - self._described_ns >= urdf_period_s * NANOSECONDS
+        if not self._description or (changed > urdf_tolerance_m and waited):
+            self._description, self._sizes, self._described_ns = body_urdf(pose, self._id), dict(pose.sizes), stamp
+            self._urdf.publish(String(data=self._description))
+        self._angles = ros4hri(pose, self._angles)
+        states = angles_to_message(self._angles, header, f"_{self._id}")
+        self._states.publish(states)
+        if self._transforms is not None and self._transforms.available:
+            frames = [transform_to_message(body_pose(pose), topics.body_frame(self._id), header)]
+            if self._publish_tf == "all":
+                frames += link_transforms(
+                    self._description, dict(zip(states.name, states.position, strict=True)), header
+                )
+            self._transforms.send(frames)
+
+
+def body_pose(pose: Pose) -> NDArray[np.float64]:
+    """T_world_body [4, 4] of REP-155's `body_<id>`: mid-hips, x forward, z to the head."""
+    T = np.eye(4)
+    T[:3, :3] = pose.rotations[pose.bone_names.index("pelvis")]
+    T[:3, 3] = (pose.joint("hip_L") + pose.joint("hip_R")) / 2
+    return T

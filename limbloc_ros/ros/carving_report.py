@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the carving node says about its cameras and its hull on `/diagnostics`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from rclpy.node import Node
+
+from limbloc_ros.core.errors import NoPerson
+from limbloc_ros.core.hull import Hull
+from limbloc_ros.core.images import Pixels
+from limbloc_ros.core.synchroniser import FrameSet, StampSynchroniser, SyncCounters
+from limbloc_ros.ros.health import Meter
+from limbloc_ros.ros.messages import ERROR, OK, WARN, make_status
+
+#: Longer without a mask or a set is worth a warning.
+SILENT_S = 2.0
+
+
+class CarvingReport:
+    """Keeps the figures of the last seconds.
+
+    Args:
+        node: named in every entry; asked for what topics exist.
+        topics: mask topic by camera.
+    """
+
+    def __init__(self, node: Node, topics: Mapping[str, str]) -> None:
+        self._node = node
+        self._topics = dict(topics)
+        self._masks = {camera: Meter() for camera in topics}
+        self._fill = dict.fromkeys(topics, float("nan"))
+        self._sets = Meter()
+        self._last: FrameSet[Pixels] | None = None
+        self._outcome: Hull | NoPerson | None = None
+        self._carve_ms = float("nan")
+
+    def mask(self, camera: str, mask: Pixels, latency_s: float) -> None:
+        """A usable mask came."""
+        self._masks[camera].tick(latency_s)
+        self._fill[camera] = 100.0 * float((mask != 0).mean())
+
+    def carved(self, frames: FrameSet[Pixels], outcome: Hull | NoPerson, carve_ms: float, latency_s: float) -> None:
+        """A set was carved and its hull published."""
+        self._last, self._outcome, self._carve_ms = frames, outcome, carve_ms
+        self._sets.tick(latency_s)
+
+    def statuses(
+        self, synchroniser: StampSynchroniser[Pixels] | None, problems: Mapping[str, str]
+    ) -> Sequence[DiagnosticStatus]:
+        """One entry for the hull, and one per camera.
+
+        Args:
+            synchroniser: None while there is no rig.
+            problems: camera -> why the rig lacks it.
+        """
+        counters = synchroniser.counters if synchroniser else SyncCounters()
+        return [
+            self._hull(synchroniser, counters, problems),
+            *(self._camera(c, counters, problems) for c in self._topics),
+        ]
+
+    def _hull(
+        self, synchroniser: StampSynchroniser[Pixels] | None, counters: SyncCounters, problems: Mapping[str, str]
+    ) -> DiagnosticStatus:
+        level, message, voxels = OK, "carving", 0
+        used: Sequence[str] = ()
+        if isinstance(self._outcome, NoPerson):
+            message = f"no person: {self._outcome.reason}"
+        elif self._outcome is not None:
+            voxels, used = self._outcome.inside_count, self._outcome.cameras
+        if synchroniser is None:
+            level, message = ERROR, f"no rig yet: {'; '.join(problems.values()) or 'waiting for CameraInfo and TF'}"
+        elif self._sets.silence_s > SILENT_S:
+            level, message = (
+                ERROR,
+                f"no set of at least {synchroniser.min_cameras} masks for {self._sets.silence_s:.0f} s",
+            )
+        values = {
+            "rate_hz": self._sets.rate_hz,
+            "latency_ms": self._sets.latency_ms,
+            "voxels_inside": voxels,
+            "carve_ms": self._carve_ms,
+            "cameras_used": " ".join(used),
+            "skew_ms": self._last.skew_ns / 1e6 if self._last else float("nan"),
+            "sets_complete": counters.complete,
+            "sets_incomplete": counters.incomplete,
+            "sets_dropped": counters.dropped,
+            "sets_waiting": synchroniser.waiting if synchroniser else 0,
+            "jumps_back_in_time": counters.resets,
+        }
+        return make_status(f"{self._node.get_name()}: hull", level, message, values)
+
+    def _camera(self, camera: str, counters: SyncCounters, problems: Mapping[str, str]) -> DiagnosticStatus:
+        meter, level, message = self._masks[camera], OK, "used"
+        rejected = self._outcome.rejected if isinstance(self._outcome, Hull) else {}
+        if camera in problems:
+            level, message = ERROR, f"not in the rig: {problems[camera]}"
+        elif meter.silence_s > SILENT_S:
+            level, message = ERROR, self._why_silent(camera, meter.silence_s)
+        elif camera in rejected:
+            level, message = WARN, f"not used: {rejected[camera]}"
+        values = {
+            "rate_hz": meter.rate_hz,
+            "latency_ms": meter.latency_ms,
+            "mask_fill_percent": self._fill[camera],
+            "received": counters.received.get(camera, 0),
+            "missing": counters.missing.get(camera, 0),
+            "late": counters.late.get(camera, 0),
+            "duplicate": counters.duplicate.get(camera, 0),
+        }
+        return make_status(f"{self._node.get_name()}: camera {camera}", level, message, values, camera)
+
+    def _why_silent(self, camera: str, silence_s: float) -> str:
+        topic = self._topics[camera]
+        publishers = self._node.count_publishers(topic)
+        if publishers:
+            why = f"{publishers} publisher(s), but no usable mask came"
+        else:
+            suffix = topic.removeprefix(camera)
+            names = [name for name, _ in self._node.get_topic_names_and_types() if name.endswith(suffix)]
+            others = [name for name in names if self._node.count_publishers(name)]
+            why = f"nobody publishes it; there are {', '.join(sorted(others)) or f'no topics that end in {suffix}'}"
+        return f"no mask on {topic} for {silence_s:.0f} s: {why}"
