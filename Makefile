@@ -1,0 +1,43 @@
+# SPDX-License-Identifier: Apache-2.0
+# Everything runs in .venv, which `make setup` makes; the other targets call it, and it is instant when nothing changed.
+
+# PYTHON=python3.12 make setup   picks the interpreter
+# ROS=kilted make setup          takes another ROS 2 distribution's wheels
+ROS ?= jazzy
+VENV ?= .venv
+RUN := $(VENV)/bin/python
+STAMP := $(VENV)/.ready-$(ROS)
+
+.PHONY: help setup demo test lint bench clean
+
+help:
+	@echo "make demo    set up, run the smart space on simulated cameras for 30 s, leave bag, CSV and report in out/"
+	@echo "make test    set up, run all tests"
+	@echo "make setup   only set up (.venv with ROS 2 and everything else from PyPI)"
+	@echo "make lint    ruff and mypy"
+	@echo "make bench   score the pose engine on all public benchmark suites"
+	@echo "make clean   remove .venv and what tools left behind"
+
+setup: $(STAMP)
+
+$(STAMP): setup.py setup.cfg pyproject.toml requirements/$(ROS).txt tools/setup_venv.sh
+	@bash tools/setup_venv.sh "$(VENV)" "$(ROS)"
+	@touch "$(STAMP)"
+
+demo: setup
+	@$(RUN) -m limbloc_ros demo $(ARGS)
+
+test: setup
+	@$(RUN) -m pytest $(ARGS)
+
+lint: setup
+	@$(RUN) -m ruff check .
+	@$(RUN) -m ruff format --check .
+	@$(RUN) -m mypy
+
+bench: setup
+	@$(RUN) benchmarks/score_suites.py $(ARGS)
+
+clean:
+	rm -rf "$(VENV)" build install log .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info
+	find limbloc_ros test -name __pycache__ -prune -exec rm -rf {} +

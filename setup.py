@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""ament_python package; `pip install -e .` works too."""
+
+from pathlib import Path
+
+from setuptools import find_packages, setup
+
+NAME = "limbloc_ros"
+SHARE = f"share/{NAME}"
+NODES = ("segmentation", "carving", "pose", "simulated_cameras", "replay", "record", "smart_space")
+
+
+def files(pattern: str) -> list[str]:
+    """Files of the source tree, relative to it, as data_files wants them."""
+    return sorted(str(path) for path in Path().glob(pattern) if path.is_file())
+
+
+setup(
+    name=NAME,
+    version="0.1.0",
+    description="Markerless 3D human posture from a few calibrated cameras, as ROS 2 nodes and offline",
+    author="limbloc maintainers",
+    author_email="maintainers@limbloc.org",
+    maintainer="limbloc maintainers",
+    maintainer_email="maintainers@limbloc.org",
+    license="Apache-2.0",
+    packages=find_packages(include=[NAME, f"{NAME}.*"]),
+    package_data={NAME: ["py.typed", "simulation/data/*"]},
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
+        (SHARE, ["package.xml"]),
+        (f"{SHARE}/launch", files("launch/*")),
+        (f"{SHARE}/config", files("config/*")),
+    ],
+    python_requires=">=3.11",
+    # Both ends were run: the lower one is what Ubuntu 24.04 (Jazzy) has in apt, save for rosbags, which it has not.
+    install_requires=[
+        "numpy>=1.26,<3",
+        "scipy>=1.11,<2",
+        "numba>=0.58,<0.69",
+        "opencv-python-headless>=4.6,<5",
+        "PyYAML>=6,<7",
+        "rosbags>=0.11,<0.12",
+        "tqdm>=4.66,<5",
+        "matplotlib>=3.6,<4",
+    ],
+    extras_require={
+        "dev": [
+            "pytest>=8,<10",
+            "hypothesis>=6.100,<7",
+            "ruff==0.17.6",
+            "mypy==2.4.1",
+            "types-PyYAML",
+            "scipy-stubs",
+        ],
+        "viewer": ["open3d-cpu>=0.19,<0.21"],
+    },
+    zip_safe=False,
+    entry_points={
+        "console_scripts": [
+            "limbloc = limbloc_ros.cli:main",
+            *(f"{node} = {NAME}.nodes.{node}:main" for node in NODES),
+        ],
+    },
+)
