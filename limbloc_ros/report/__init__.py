@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures and the HTML page made from a run."""
+"""Run -> pictures and one page for people: the paper's results section made from a recording."""

@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The report's numbers: what was found, how good, how fast."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from limbloc_ros.core.pose import JOINT, Array
+from limbloc_ros.report.run import LIMB_JOINTS, RunData, joint_jumps
+
+Rows = list[tuple[str, str]]
+
+#: The paper claims "precision within 5 cm".
+CLAIM_M = 0.05
+
+
+def summary(run: RunData) -> Rows:
+    """(name, value) rows of the run as a whole."""
+    frames, found = len(run.joints), int(run.found.sum())
+    rows: Rows = [
+        ("frames", f"{frames}, {_seconds(run)}" if run.consecutive else f"{frames}, unrelated poses"),
+        ("person found", f"{found} ({_percent(found, frames)})"),
+        ("no person", f"{frames - found} ({_percent(frames - found, frames)})"),
+        ("not reliable", f"{int((run.found & ~run.reliable).sum())} of the frames with a person"),
+        ("energy (eq. 2)", _median_p95(run.energy, 1.0, "", 3)),
+        ("process time", _median_p95(run.total_ms, 1.0, " ms per frame", 1)),
+        ("expected joint error", _median_p95(run.sigma[:, [JOINT[n] for n in LIMB_JOINTS]], 1000.0, " mm (sigma)", 0)),
+    ]
+    if run.consecutive:
+        broken = {name: int(at.sum()) for name, at in joint_jumps(run).items() if at.any()}
+        worst = ", ".join(f"{name} {n}" for name, n in sorted(broken.items(), key=lambda item: -item[1])[:4])
+        rows.append(("jumps", f"{sum(broken.values())} in {len(broken)} joints ({worst})" if broken else "none"))
+    error = run.error_m
+    if error is not None:
+        limbs = error[:, [JOINT[name] for name in LIMB_JOINTS]]
+        known = limbs[np.isfinite(limbs)]
+        rows.append(
+            (f"true error, {len(LIMB_JOINTS)} joints", f"mean {_mean(limbs)}, {_median_p95(limbs, 1000.0, ' mm', 1)}")
+        )
+        if len(known):
+            rows.append(("within 5 cm", _percent(int((known < CLAIM_M).sum()), len(known)) + " of the joints found"))
+            inside = limbs / run.sigma[:, [JOINT[name] for name in LIMB_JOINTS]]
+            judged = inside[np.isfinite(inside)]
+            rows.append(("within 2 sigma", _percent(int((judged < 2).sum()), len(judged)) + " of the joints found"))
+    return rows
+
+
+def error_table(run: RunData) -> list[list[str]]:
+    """Joint, mean, median, 95th percentile (mm) and the share within 5 cm, of every joint whose truth is known."""
+    error = run.error_m
+    if error is None:
+        return []
+    table = []
+    for name, index in JOINT.items():
+        known = error[np.isfinite(error[:, index]), index]
+        if len(known):
+            numbers = (known.mean(), np.median(known), np.percentile(known, 95))
+            share = _percent(int((known < CLAIM_M).sum()), len(known))
+            table.append([name.replace("_", " "), *(f"{1000 * v:.1f}" for v in numbers), share])
+    return table
+
+
+def _seconds(run: RunData) -> str:
+    return f"{run.seconds[-1]:.2f} s"
+
+
+def _percent(part: int, whole: int) -> str:
+    return f"{100 * part / whole:.1f} %" if whole else "0 %"
+
+
+def _mean(values: Array) -> str:
+    return f"{1000 * np.nanmean(values):.1f} mm" if np.isfinite(values).any() else "unknown"
+
+
+def _median_p95(values: Array, scale: float, unit: str, digits: int) -> str:
+    known = scale * values[np.isfinite(values)]
+    if not len(known):
+        return "unknown"
+    return f"median {np.median(known):.{digits}f}{unit}, 95th percentile {np.percentile(known, 95):.{digits}f}{unit}"
