@@ -1,0 +1,184 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Kernels of `room`: shading, a z-buffer rasteriser, shadow on the floor, soft edges, noise.
+
+All trust their callers; images are uint8 [H, W, 3] bgr, boxes are x0, y0, x1, y1 with the ends left out.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+
+@njit(cache=True)
+def shade_vertices(vertices, faces, light, tone, shade):
+    """Gouraud shading [V]: light from above and a lamp in the direction `light`, times each vertex' own `tone`."""
+    n = len(vertices)
+    normals = np.zeros((n, 3))
+    for f in range(len(faces)):
+        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+        ux, uy, uz = vertices[b, 0] - vertices[a, 0], vertices[b, 1] - vertices[a, 1], vertices[b, 2] - vertices[a, 2]
+        vx, vy, vz = vertices[c, 0] - vertices[a, 0], vertices[c, 1] - vertices[a, 1], vertices[c, 2] - vertices[a, 2]
+        nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+        for v in (a, b, c):
+            normals[v, 0] += nx
+            normals[v, 1] += ny
+            normals[v, 2] += nz
+    for v in range(n):
+        x, y, z = normals[v, 0], normals[v, 1], normals[v, 2]
+        s = 1.0 / max(math.sqrt(x * x + y * y + z * z), 1e-12)
+        lamp = max((x * light[0] + y * light[1] + z * light[2]) * s, 0.0)
+        shade[v] = (0.52 + 0.14 * z * s + 0.46 * lamp) * tone[v]
+
+
+@njit(cache=True)
+def rasterise(uv, depth, faces, shade, garments, stripe, palette, near, image, mask, zbuffer, x0, y0, x1, y1):
+    """Draw the triangles that face the camera into `image` and `mask` (255), nearest first by `zbuffer`.
+
+    uv [V, 2] px, depth [V] m, shade [V], garments [V, 4] (see person.GARMENTS), stripe [V] rest height m for the
+    shirt's pattern, palette [5, 3] bgr of skin, hair, shirt, trousers, shoes. `mask` is 0 and `zbuffer` (1 / depth) is
+    cleared here within the box.
+    """
+    for y in range(y0, y1):
+        for x in range(x0, x1):
+            zbuffer[y, x] = 0.0
+    for f in range(len(faces)):
+        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+        if depth[a] < near or depth[b] < near or depth[c] < near:
+            continue
+        ax, ay = uv[a, 0], uv[a, 1]
+        bx, by = uv[b, 0], uv[b, 1]
+        cx, cy = uv[c, 0], uv[c, 1]
+        area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
+        if area >= -1e-9:  # image y points down: a face seen from outside has a negative area
+            continue
+        left = max(int(math.ceil(min(ax, bx, cx))), x0)
+        right = min(int(math.floor(max(ax, bx, cx))), x1 - 1)
+        top = max(int(math.ceil(min(ay, by, cy))), y0)
+        bottom = min(int(math.floor(max(ay, by, cy))), y1 - 1)
+        if left > right or top > bottom:
+            continue
+        inv = 1.0 / area
+        wa_dx, wb_dx = -(cy - by) * inv, -(ay - cy) * inv
+        za, zb, zc = 1.0 / depth[a], 1.0 / depth[b], 1.0 / depth[c]
+        for y in range(top, bottom + 1):
+            wa = ((cx - bx) * (y - by) - (cy - by) * (left - bx)) * inv
+            wb = ((ax - cx) * (y - cy) - (ay - cy) * (left - cx)) * inv
+            for x in range(left, right + 1):
+                wc = 1.0 - wa - wb
+                if wa >= -1e-9 and wb >= -1e-9 and wc >= -1e-9:
+                    z = wa * za + wb * zb + wc * zc
+                    if z > zbuffer[y, x]:
+                        zbuffer[y, x] = z
+                        s = wa * shade[a] + wb * shade[b] + wc * shade[c]
+                        kind = 0
+                        if wa * garments[a, 3] + wb * garments[b, 3] + wc * garments[c, 3] > 0:
+                            kind = 4
+                        elif wa * garments[a, 1] + wb * garments[b, 1] + wc * garments[c, 1] > 0:
+                            kind = 2
+                            height = wa * stripe[a] + wb * stripe[b] + wc * stripe[c]
+                            if (height * 14.0) % 1.0 < 0.3:
+                                s *= 0.86
+                        elif wa * garments[a, 2] + wb * garments[b, 2] + wc * garments[c, 2] > 0:
+                            kind = 3
+                        elif wa * garments[a, 0] + wb * garments[b, 0] + wc * garments[c, 0] > 0:
+                            kind = 1
+                        for k in range(3):
+                            image[y, x, k] = min(int(palette[kind, k] * s + 0.5), 255)
+                        mask[y, x] = 255
+                wa += wa_dx
+                wb += wb_dx
+
+
+@njit(cache=True)
+def soften_edges(image, copy, mask, x0, y0, x1, y1):
+    """Blur the silhouette's edge by 3 x 3 (1 2 1), as a lens and a sensor do; `copy` is image[y0:y1, x0:x1] before."""
+    for y in range(y0 + 1, y1 - 1):
+        for x in range(x0 + 1, x1 - 1):
+            m = mask[y, x]
+            if m == mask[y, x - 1] and m == mask[y, x + 1] and m == mask[y - 1, x] and m == mask[y + 1, x]:
+                continue
+            i, j = y - y0, x - x0
+            for k in range(3):
+                total = (
+                    4 * int(copy[i, j, k])
+                    + 2 * (int(copy[i - 1, j, k]) + int(copy[i + 1, j, k]) + int(copy[i, j - 1, k]) + int(copy[i, j + 1, k]))
+                    + int(copy[i - 1, j - 1, k])
+                    + int(copy[i - 1, j + 1, k])
+                    + int(copy[i + 1, j - 1, k])
+                    + int(copy[i + 1, j + 1, k])
+                )
+                image[y, x, k] = (total + 8) // 16
+
+
+@njit(cache=True)
+def cover_floor(points, heights, faces, fade_m, x0, y0, cover):
+    """Rasterise a mesh that was projected onto the floor; cover [h, w] float32 becomes 1 under it.
+
+    points [V, 2] in cells; a face's cover falls with its height above the floor, to 0 at `fade_m` m.
+    """
+    h, w = cover.shape
+    for f in range(len(faces)):
+        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+        value = 1.0 - min(heights[a], heights[b], heights[c]) / fade_m
+        if value <= 0.0:
+            continue
+        ax, ay = points[a, 0] - x0, points[a, 1] - y0
+        bx, by = points[b, 0] - x0, points[b, 1] - y0
+        cx, cy = points[c, 0] - x0, points[c, 1] - y0
+        area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
+        if area <= 1e-9:  # the half of the mesh that faces the light is enough
+            continue
+        left, right = max(int(math.ceil(min(ax, bx, cx))), 0), min(int(math.floor(max(ax, bx, cx))), w - 1)
+        top, bottom = max(int(math.ceil(min(ay, by, cy))), 0), min(int(math.floor(max(ay, by, cy))), h - 1)
+        inv = 1.0 / area
+        for y in range(top, bottom + 1):
+            for x in range(left, right + 1):
+                wa = ((cx - bx) * (y - by) - (cy - by) * (x - bx)) * inv
+                wb = ((ax - cx) * (y - cy) - (ay - cy) * (x - cx)) * inv
+                if wa >= 0 and wb >= 0 and wa + wb <= 1 and value > cover[y, x]:
+                    cover[y, x] = value
+
+
+@njit(cache=True)
+def darken_floor(image, floor, light, cell_x0, cell_y0, x0, y0, x1, y1):
+    """Multiply floor pixels by `light` [h, w] (1 = no shadow), bilinear; floor [H, W, 2] are the pixels' cells."""
+    h, w = light.shape
+    for y in range(y0, y1):
+        for x in range(x0, x1):
+            gx, gy = floor[y, x, 0] - cell_x0, floor[y, x, 1] - cell_y0
+            if gx < 0 or gy < 0 or gx >= w - 1 or gy >= h - 1:
+                continue
+            i, j = int(gy), int(gx)
+            fy, fx = gy - i, gx - j
+            value = (light[i, j] * (1 - fx) + light[i, j + 1] * fx) * (1 - fy) + (
+                light[i + 1, j] * (1 - fx) + light[i + 1, j + 1] * fx
+            ) * fy
+            if value < 0.999:
+                for k in range(3):
+                    image[y, x, k] = int(image[y, x, k] * value + 0.5)
+
+
+@njit(cache=True)
+def expose(image, gain, noise, key, out):
+    """out = image * gain + noise, rounded and clipped; each row takes its noise from elsewhere in the bank `noise`.
+
+    `key` uint64 chooses the places; the bank is int8 with at least as many values as a row.
+    """
+    rows, width = image.shape
+    span = np.uint64(len(noise) - width + 1)
+    factor = np.float32(gain)
+    state = key
+    for y in range(rows):
+        state = state + np.uint64(0x9E3779B97F4A7C15)
+        z = state
+        z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+        z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+        z = z ^ (z >> np.uint64(31))
+        start = np.int64(z % span)
+        row, grain, target = image[y], noise[start : start + width], out[y]
+        for x in range(width):
+            value = np.float32(row[x]) * factor + np.float32(grain[x]) + np.float32(0.5)
+            target[x] = np.uint8(min(max(value, np.float32(0.0)), np.float32(255.0)))

@@ -1,0 +1,296 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A room with cameras and a person in it: images as a camera driver would deliver them, and the truth beside them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from limbloc_ros.core.camera import Camera, Rig
+from limbloc_ros.core.errors import ConfigError, RigError
+from limbloc_ros.simulation import _render_kernels as kernels
+from limbloc_ros.simulation.motion import Motion
+from limbloc_ros.simulation.person import Person, PosedPerson, load_person
+from limbloc_ros.simulation.surroundings import HALF_M, HEIGHT_M, Backdrop, backdrop
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+Mask = NDArray[np.uint8]
+
+# The cameras stand on this ring, between the door's sides; their heights repeat.
+_RING_M = 2.75
+_HEIGHTS_M = (2.4, 1.3, 2.8, 1.7, 2.1, 1.2, 2.6, 1.9)
+
+_LIGHT = np.array([0.35, -0.25, 0.9]) / np.linalg.norm([0.35, -0.25, 0.9])
+_CELL_M = 0.02
+_NEAR_M = 0.15
+
+# bgr of skin, hair, shirt, trousers, shoes. Some come close to a wall or to the floor, as in life.
+_PALETTES = {
+    "man": ((128, 160, 205), (34, 40, 52), (176, 196, 206), (92, 66, 52), (46, 44, 44)),
+    "woman": ((140, 172, 218), (40, 74, 120), (92, 70, 150), (104, 106, 108), (60, 62, 120)),
+    "child": ((132, 168, 214), (52, 92, 140), (70, 150, 196), (150, 110, 60), (196, 196, 200)),
+    "heavy": ((96, 124, 166), (58, 58, 60), (150, 140, 108), (70, 92, 112), (40, 48, 60)),
+}
+
+
+def default_rig(n_cameras: int = 8, width: int = 640, height: int = 480) -> Rig:
+    """A ring of cameras at heights of 1.2 to 2.8 m around a space of 3 x 3 m in a room of 6 x 6 m.
+
+    They look at the centre from 2.75 m with a horizontal angle of view of 78 degrees and a slight barrel distortion;
+    every camera differs a little from the others. The origin is the middle of the floor.
+
+    Args:
+        n_cameras: 2 to 16.
+        width, height: image size in px.
+
+    Raises:
+        RigError: a number of cameras or an image size that is out of range.
+    """
+    if not 2 <= n_cameras <= 16:
+        raise RigError(f"n_cameras: expected 2 to 16, got {n_cameras}")
+    if not (64 <= width <= 8192 and 64 <= height <= 8192):
+        raise RigError(f"image size: expected 64 to 8192 px on a side, got {width}x{height}")
+    cameras = []
+    for k in range(n_cameras):
+        # The door is at angle pi: the first and the last camera stand on either side of it. Two cameras that face each
+        # other would see one silhouette: put a pair at right angles.
+        angle = math.pi + (2 * math.pi * (k + 0.5) / n_cameras if n_cameras > 2 else math.pi * (0.75 + 0.5 * k))
+        shift = (k // len(_HEIGHTS_M)) * 3
+        centre = np.array(
+            [_RING_M * math.cos(angle), _RING_M * math.sin(angle), _HEIGHTS_M[(k + shift) % len(_HEIGHTS_M)]]
+        )
+        forward = np.array([0.0, 0.0, 0.95]) - centre
+        forward /= np.linalg.norm(forward)
+        right = np.cross(forward, [0.0, 0.0, 1.0])
+        right /= np.linalg.norm(right)
+        T = np.eye(4)
+        T[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
+        T[:3, 3] = centre
+        focal = 0.62 * max(width, height * 4 / 3) * (1 + 0.012 * math.sin(2.3 * k))
+        K = np.array(
+            [
+                [focal, 0.0, (width - 1) / 2 + 3 * math.sin(1.7 * k + 1)],
+                [0.0, focal, (height - 1) / 2 + 3 * math.cos(2.9 * k)],
+                [0.0, 0.0, 1.0],
+            ]
+        )
+        distortion = np.array([-0.07 - 0.02 * math.sin(k + 0.5), 0.02 + 0.005 * math.cos(k), 0.0, 0.0])
+        cameras.append(Camera(f"cam{k}", width, height, K, T, distortion, "radtan"))
+    return Rig(tuple(cameras), np.array([-1.5, -1.5, 0.0]), np.array([1.5, 1.5, 2.4]))
+
+
+@dataclass(frozen=True)
+class SimulatedFrame:
+    """One instant of the room.
+
+    Attributes:
+        t: s since the start.
+        images: camera name -> uint8 [height, width, 3] bgr.
+        masks: camera name -> uint8 [height, width], 255 where the person is: the true silhouette.
+        joints: [25, 3] the true joints (core.pose.JOINT_NAMES), m; None while the room is empty.
+        action: the name of the motion, `empty` while the room is empty.
+    """
+
+    t: float
+    images: dict[str, Image]
+    masks: dict[str, Mask]
+    joints: Array | None
+    action: str
+
+
+@dataclass(frozen=True)
+class _Instant:
+    """What all cameras share at one time: the lit person, and the light that is left on the floor around it."""
+
+    t: float
+    person: PosedPerson
+    shade: Array
+    floor_light: NDArray[np.float32]  # [h, w] of cells
+    floor_cell: tuple[int, int]  # x, y of its first cell
+
+
+class _View:
+    """A camera with its buffers."""
+
+    def __init__(self, camera: Camera, index: int, scenery: Backdrop) -> None:
+        self.camera = camera
+        self.index = index
+        self.empty = scenery.image
+        self.floor = np.nan_to_num((scenery.floor_m + HALF_M) / _CELL_M, nan=-1e6).astype(np.float32)
+        self.zbuffer = np.zeros((camera.height, camera.width), np.float32)
+
+
+class SimulatedRoom:
+    """Cameras that film a person in a room; everything is a pure function of (arguments, t).
+
+    Args:
+        rig: the cameras, inside the room (walls at x, y = +-3 m, ceiling at 2.9 m); `default_rig()` makes some.
+        person: one of `person.PERSON_NAMES`, or a Person.
+        seed: of the motions, the textures and the noise.
+        empty_s: the room is empty this long, for the background to be learnt.
+        playlist: names of motions in order (`motion.motion_names()`), repeated for ever; None is a varied default.
+        noise_sigma: standard deviation of the sensor noise, grey levels.
+        light_drift: the light changes slowly by up to this fraction.
+
+    Raises:
+        ConfigError: a value out of range. RigError: a camera outside the room.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        person: str | Person = "man",
+        seed: int = 0,
+        empty_s: float = 1.5,
+        playlist: Sequence[str] | None = None,
+        noise_sigma: float = 2.5,
+        light_drift: float = 0.03,
+    ) -> None:
+        if not 0 <= noise_sigma <= 25:
+            raise ConfigError(f"noise_sigma: expected 0 to 25 grey levels, got {noise_sigma}")
+        if not 0 <= light_drift <= 0.5:
+            raise ConfigError(f"light_drift: expected 0 to 0.5, got {light_drift}")
+        for camera in rig.cameras:
+            x, y, z = camera.T_world_camera[:3, 3]
+            if max(abs(x), abs(y)) >= HALF_M or not 0 < z < HEIGHT_M:
+                raise RigError(
+                    f"camera {camera.name} stands at ({x:.2f}, {y:.2f}, {z:.2f}) m; expected inside the simulated room: "
+                    f"|x|, |y| below {HALF_M} m and z between 0 and {HEIGHT_M} m"
+                )
+        self.rig = rig
+        self.person = load_person(person) if isinstance(person, str) else person
+        self.motion = Motion(self.person, seed, empty_s, playlist)
+        self.seed = seed
+        self._light_drift = light_drift
+        rng = np.random.default_rng([seed, 11])
+        self._noise = np.clip(np.rint(rng.normal(0, noise_sigma, 1 << 20)), -127, 127).astype(np.int8)
+        self._tone = rng.uniform(0.93, 1.07, len(self.person.vertices))
+        self._palette = np.array(_PALETTES.get(self.person.name, _PALETTES["man"]), dtype=np.float64)
+        self._stripe = np.ascontiguousarray(self.person.vertices[:, 2])
+        self._views: dict[str, _View] = {}
+        self._instant: _Instant | None = None
+
+    def frame(self, t: float) -> SimulatedFrame:
+        """What all cameras see at time t s, with the truth."""
+        images, masks = {}, {}
+        for name in self.rig.names:
+            images[name], masks[name] = self.render_with_mask(name, t)
+        return SimulatedFrame(t, images, masks, self.joints(t), self.motion.action(t))
+
+    def joints(self, t: float) -> Array | None:
+        """The true joints [25, 3] at time t s, m, in the order of JOINT_NAMES; None while the room is empty."""
+        posed = self.motion.pose(t)
+        return None if posed is None else posed.joints.copy()
+
+    def render(self, camera_name: str, t: float) -> Image:
+        """The image uint8 [height, width, 3] bgr of one camera at time t s; the same as in `frame`."""
+        return self.render_with_mask(camera_name, t)[0]
+
+    def render_with_mask(self, camera_name: str, t: float) -> tuple[Image, Mask]:
+        """Image and true silhouette (255 = person) of one camera at time t s.
+
+        Raises:
+            RigError: no such camera.
+        """
+        view = self._view(camera_name)
+        height, width = view.camera.height, view.camera.width
+        mask = np.zeros((height, width), np.uint8)
+        clean = view.empty
+        instant = self._instant_at(t)
+        if instant is not None:
+            clean = view.empty.copy()
+            self._draw_shadow(view, instant, clean)
+            self._draw_person(view, instant, clean, mask)
+        out = np.empty((height, width * 3), np.uint8)
+        key = np.random.SeedSequence([self.seed, view.index, round(t * 1e6) & 0xFFFFFFFF]).generate_state(1, np.uint64)[0]
+        kernels.expose(clean.reshape(height, -1), self._gain(t, view.index), self._noise, key, out)
+        return out.reshape(height, width, 3), mask
+
+    def warm_up(self) -> None:
+        """Compile or load every kernel and look at the empty room, so that the first images are not late."""
+        self.frame(self.motion.empty_s + 1.0)
+
+    # ---- one image --------------------------------------------------------------------------------------------------
+
+    def _view(self, name: str) -> _View:
+        if name not in self._views:
+            camera = self.rig.camera(name)
+            self._views[name] = _View(camera, self.rig.names.index(name), backdrop(camera, self.seed))
+        return self._views[name]
+
+    def _gain(self, t: float, index: int) -> float:
+        """Daylight that drifts (the same for all cameras), and each camera's own exposure."""
+        drift = 0.7 * math.sin(2 * math.pi * t / 61.0 + self.seed) + 0.3 * math.sin(2 * math.pi * t / 17.0)
+        return 1.0 + self._light_drift * drift + 0.02 * math.sin(3.1 * index + 0.4)
+
+    def _instant_at(self, t: float) -> _Instant | None:
+        if self._instant is not None and self._instant.t == t:
+            return self._instant
+        posed = self.motion.pose(t)
+        if posed is None:
+            return None
+        shade = np.empty(len(posed.vertices))
+        kernels.shade_vertices(posed.vertices, self.person.faces, _LIGHT, self._tone, shade)
+        light, cell = self._floor_light(posed.vertices)
+        self._instant = _Instant(t, posed, shade, light, cell)
+        return self._instant
+
+    def _floor_light(self, vertices: Array) -> tuple[NDArray[np.float32], tuple[int, int]]:
+        """The lamp's shadow (soft) and the dark below what touches the floor (softer), as remaining light by cell."""
+        heights = np.maximum(vertices[:, 2], 0.0)
+        below = (vertices[:, :2] + HALF_M) / _CELL_M
+        lamp = below - heights[:, None] * (_LIGHT[:2] / _LIGHT[2]) / _CELL_M
+        margin = 14
+        low = np.floor(np.minimum(below.min(0), lamp.min(0))).astype(int) - margin
+        high = np.ceil(np.maximum(below.max(0), lamp.max(0))).astype(int) + margin
+        shape = (high[1] - low[1], high[0] - low[0])
+        shadow, contact = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+        kernels.cover_floor(lamp, heights, self.person.faces, 1e9, low[0], low[1], shadow)
+        kernels.cover_floor(below, heights, self.person.faces, 0.5, low[0], low[1], contact)
+        shadow = cv2.blur(cv2.blur(shadow, (5, 5)), (5, 5))
+        contact = cv2.blur(cv2.blur(contact, (9, 9)), (9, 9))
+        light = (1 - np.float32(0.28) * shadow) * (1 - np.float32(0.4) * contact)
+        return np.ascontiguousarray(light), (int(low[0]), int(low[1]))
+
+    def _draw_shadow(self, view: _View, instant: _Instant, image: Image) -> None:
+        h, w = instant.floor_light.shape
+        x0, y0 = instant.floor_cell
+        # A dense rim, because the image of a straight edge is not straight.
+        s = np.linspace(0, 1, 9)
+        rim = np.concatenate([[(a, 0), (a, 1), (0, a), (1, a)] for a in s])
+        ground = np.zeros((len(rim), 3))
+        ground[:, :2] = (rim * [w, h] + [x0, y0]) * _CELL_M - HALF_M
+        uv, _ = view.camera.world_to_image(ground)
+        box = _image_box(uv, view.camera)
+        if box is not None:
+            kernels.darken_floor(image, view.floor, instant.floor_light, x0, y0, *box)
+
+    def _draw_person(self, view: _View, instant: _Instant, image: Image, mask: Mask) -> None:
+        uv, depth = view.camera.world_to_image(instant.person.vertices)
+        if not (depth > _NEAR_M).any():
+            return
+        box = _image_box(uv[depth > _NEAR_M], view.camera)
+        if box is None:
+            return
+        kernels.rasterise(
+            uv, depth, self.person.faces, instant.shade, self.person.garments, self._stripe, self._palette, _NEAR_M,
+            image, mask, view.zbuffer, *box,
+        )  # fmt: skip
+        x0, y0, x1, y1 = box
+        kernels.soften_edges(image, image[y0:y1, x0:x1].copy(), mask, x0, y0, x1, y1)
+
+
+def _image_box(uv: Array, camera: Camera) -> tuple[int, int, int, int] | None:
+    """x0, y0, x1, y1 around points within the image with a margin; the whole image if some lie behind the camera."""
+    if np.isnan(uv).any():
+        return 0, 0, camera.width, camera.height
+    low, high = np.floor(uv.min(0)) - 2, np.ceil(uv.max(0)) + 3
+    x0, y0 = int(max(low[0], 0)), int(max(low[1], 0))
+    x1, y1 = int(min(high[0], camera.width)), int(min(high[1], camera.height))
+    return (x0, y0, x1, y1) if x0 < x1 and y0 < y1 else None
