@@ -11,6 +11,7 @@ import rclpy
 from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from ros_graph import DOMAIN
 
 from limbloc_ros.core.config import BackgroundConfig, FitConfig, HullConfig, setting
 from limbloc_ros.core.errors import ConfigError
@@ -26,7 +27,7 @@ class Lists:
 @pytest.fixture
 def context() -> Iterator[Context]:
     context = Context()
-    rclpy.init(context=context, domain_id=99)
+    rclpy.init(context=context, domain_id=DOMAIN)
     yield context
     rclpy.shutdown(context=context)
 

@@ -1,0 +1,159 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The nodes over real DDS: what comes in, what goes out, and what they say when the input is bad."""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticStatus
+from ros_graph import Graph
+from sensor_msgs.msg import CompressedImage, Image
+from std_srvs.srv import SetBool, Trigger
+
+from limbloc_ros.nodes.segmentation import SegmentationNode
+from limbloc_ros.ros import topics
+from limbloc_ros.ros.image_messages import message_to_mask, pixels_to_compressed, pixels_to_image
+from limbloc_ros.ros.messages import make_header, stamp_ns
+
+LEARNING = 4
+FRAME_NS = 33_333_333
+
+
+@pytest.fixture
+def graph() -> Iterator[Graph]:
+    graph = Graph()
+    yield graph
+    graph.close()
+
+
+class Room:
+    """Noisy pictures of a plain wall, with or without a box in front of it."""
+
+    def __init__(self, width: int = 160, height: int = 120) -> None:
+        self.random = np.random.default_rng(0)
+        self.box = np.zeros((height, width), bool)
+        self.box[30:100, 60:90] = True
+
+    def picture(self, box: bool) -> np.ndarray:
+        picture = np.full((*self.box.shape, 3), (90, 120, 100), np.int16)
+        if box:
+            picture[self.box] = (30, 40, 200)
+        return np.clip(picture + self.random.normal(0, 2, picture.shape), 0, 255).astype(np.uint8)
+
+
+def header(n: int):
+    return make_header(1_000_000_000_000 + n * FRAME_NS, "cam0_optical")
+
+
+def test_segmentation_learns_then_gives_masks_with_the_images_stamps(graph: Graph) -> None:
+    graph.add(SegmentationNode, camera="cam0", background__learning_frames=LEARNING, reliability="reliable")
+    raw, png = graph.collect(Image, "cam0/mask"), graph.collect(CompressedImage, "cam0/mask/compressed")
+    diagnostics = graph.diagnostics()
+    images = graph.publisher(Image, "cam0/image_raw")
+    room = Room()
+    for n in range(LEARNING):
+        images.publish(pixels_to_image(room.picture(box=False), header(n)))
+        graph.until(lambda n=n: len(raw) == len(png) == n + 1)
+    graph.until(lambda: diagnostics["segmentation: mask"] is not None)
+    assert not message_to_mask(raw[-1]).any()
+    for n in range(LEARNING, LEARNING + 3):
+        images.publish(pixels_to_image(room.picture(box=True), header(n)))
+        graph.until(lambda n=n: len(raw) == len(png) == n + 1)
+    mask = message_to_mask(raw[-1])
+    assert (raw[-1].encoding, raw[-1].header.frame_id) == ("mono8", "cam0_optical")
+    assert [stamp_ns(msg.header) for msg in png] == [stamp_ns(header(n)) for n in range(7)]
+    np.testing.assert_array_equal(message_to_mask(png[-1]), mask)
+    overlap = ((mask > 0) & room.box).sum() / ((mask > 0) | room.box).sum()
+    assert overlap > 0.95
+    graph.until(diagnostics.says("segmentation: mask", "segmenting"))
+    assert float(diagnostics.value("segmentation: mask", "mask_fill_percent")) == pytest.approx(
+        100 * (mask > 0).mean(), abs=0.1
+    )
+
+
+def test_segmentation_computes_only_the_masks_somebody_wants(graph: Graph) -> None:
+    node = graph.add(SegmentationNode, camera="cam0", transport="compressed", reliability="reliable")
+    png = graph.collect(CompressedImage, "cam0/mask/compressed")
+    graph.until(lambda: node.png_mask.get_subscription_count() == 1)
+    published: list[object] = []
+    node.raw_mask.publish = published.append
+    images = graph.publisher(CompressedImage, "cam0/image_raw/compressed")
+    images.publish(pixels_to_compressed(Room().picture(box=False), header(0)))
+    graph.until(lambda: len(png) == 1)
+    assert not published
+
+
+def test_segmentation_recaptures_and_freezes_its_background(graph: Graph) -> None:
+    node = graph.add(
+        SegmentationNode, camera="cam0", background__learning_frames=LEARNING, reliability="reliable", publish="always"
+    )
+    masks = graph.collect(Image, "cam0/mask")
+    images = graph.publisher(Image, "cam0/image_raw")
+    room = Room()
+
+    def send(box: bool, count: int) -> np.ndarray:
+        for _ in range(count):
+            before = len(masks)
+            images.publish(pixels_to_image(room.picture(box), header(before)))
+            graph.until(lambda before=before: len(masks) == before + 1)
+        return message_to_mask(masks[-1])
+
+    send(False, LEARNING)
+    assert send(True, 1).any()
+    response = graph.call(SetBool, "segmentation/freeze_background", SetBool.Request(data=True))
+    assert response.success
+    assert "frozen" in response.message
+    assert node.model.frozen
+    response = graph.call(Trigger, "segmentation/recapture_background", Trigger.Request())
+    assert "keep the room empty" in response.message
+    assert not send(True, LEARNING).any()  # now the box is background
+    assert not send(True, 1).any()
+    assert send(False, 1).any()
+
+
+@pytest.mark.parametrize(
+    ("kind", "words"),
+    [
+        ("truncated", ["camera cam0", "JPEG", "truncated"]),
+        ("h264", ["camera cam0", "expected a JPEG or PNG"]),
+        ("size", ["camera cam0", "160x120", "320x240"]),
+    ],
+)
+def test_segmentation_survives_bad_images_and_says_so(graph: Graph, kind: str, words: list[str]) -> None:
+    graph.add(SegmentationNode, camera="cam0", transport="compressed", reliability="reliable")
+    masks = graph.collect(CompressedImage, "cam0/mask/compressed")
+    diagnostics = graph.diagnostics()
+    images = graph.publisher(CompressedImage, "cam0/image_raw/compressed")
+    good = pixels_to_compressed(Room().picture(box=False), header(0))
+    images.publish(good)
+    graph.until(lambda: len(masks) == 1)
+    bad = pixels_to_compressed(Room(320, 240).picture(box=False), header(1))
+    if kind == "truncated":
+        bad.data = array("B", bad.data[: len(bad.data) // 2])
+    elif kind == "h264":
+        bad.format, bad.data = "h264", array("B", bytes(100))
+    images.publish(bad)
+    graph.until(diagnostics.says("segmentation: mask", *words))
+    assert diagnostics["segmentation: mask"].level == DiagnosticStatus.ERROR
+    images.publish(good)
+    graph.until(lambda: len(masks) == 2)
+
+
+def test_segmentation_says_when_no_camera_is_there(graph: Graph) -> None:
+    graph.add(SegmentationNode, "left_eye", camera="left")
+    diagnostics = graph.diagnostics()
+    graph.until(diagnostics.says("left_eye: mask", "no image on left/image_raw", "nobody publishes it"))
+    assert diagnostics["left_eye: mask"].hardware_id == "left"
+
+
+def test_segmentation_takes_live_parameters(graph: Graph) -> None:
+    node = graph.add(SegmentationNode, camera="cam0")
+    assert node.settings.camera == "cam0"
+    from rclpy.parameter import Parameter
+
+    assert node.set_parameters([Parameter("background.threshold_sigmas", value=9.0)])[0].successful
+    assert node.model.config.threshold_sigmas == 9.0
+    assert topics.mask("cam0") == "cam0/mask"
