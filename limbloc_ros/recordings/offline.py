@@ -1,0 +1,216 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The offline run: a recording -> the pose of every frame, on all cores, the same code as the live nodes.
+
+Frames are independent (paper section 4), so carving and fitting go to a pool of single-threaded processes, while the
+masks come from one sequential stream. Any number of jobs gives the same result. Only with `temporal` each frame starts
+from the one before, and one process does them in order.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import multiprocessing
+import os
+import shutil
+import signal
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from limbloc_ros import __version__
+from limbloc_ros.core.camera import Rig
+from limbloc_ros.core.config import BackgroundConfig, FitConfig, HullConfig, SyncConfig
+from limbloc_ros.core.errors import InputError, LimblocError, NoPerson
+from limbloc_ros.core.pipeline import Carver, PoseEstimator
+from limbloc_ros.recordings.cases import pack_mask, unpack_mask
+from limbloc_ros.recordings.checkpoint import Checkpoint, fingerprint
+from limbloc_ros.recordings.results import FrameResult, Run
+from limbloc_ros.recordings.sources import MaskSet, Source
+
+
+class Interrupted(LimblocError):
+    """Ctrl-C: what was finished is kept, the message says how to go on."""
+
+
+@dataclass(frozen=True)
+class OfflineConfig:
+    """Every parameter of an offline run, in the sections of a `--config` YAML."""
+
+    background: BackgroundConfig = field(default_factory=BackgroundConfig)
+    sync: SyncConfig = field(default_factory=SyncConfig)
+    hull: HullConfig = field(default_factory=HullConfig)
+    fit: FitConfig = field(default_factory=FitConfig)
+
+
+#: Called after each frame with the finished ones and, where it is known, their total.
+Progress = Callable[[int, int | None], None]
+
+
+def process(
+    source: Source,
+    config: OfflineConfig,
+    *,
+    partial: Path | None = None,
+    jobs: int = 0,
+    progress: Progress = lambda done, total: None,
+    say: Callable[[str], None] = lambda text: None,
+) -> Run:
+    """Fit every frame of a recording.
+
+    Args:
+        source: where the masks come from.
+        config: all parameters.
+        partial: folder in which finished frames are kept; the caller calls `forget_partial` once it has saved the
+            run. None: nothing is kept.
+        jobs: processes; 0 takes one per usable core.
+        progress: told after each frame.
+        say: told in words what a person would want to know.
+
+    Raises:
+        InputError: the recording cannot be used.
+        Interrupted: Ctrl-C.
+    """
+    if jobs < 0:
+        raise InputError(f"jobs: expected 0 (one per core) or more, got {jobs}")
+    # A temporal frame depends on all before it, so that half a run is of no use.
+    keep = partial is not None and not config.fit.temporal
+    checkpoint = Checkpoint(partial if keep else None, run_key(source, config))
+    if checkpoint.discarded:
+        say(f"the unfinished run in {partial} was of other input or settings; starting anew")
+    done = checkpoint.done
+    if done:
+        say(f"going on after frame {len(done)}, where the last run was interrupted")
+    if config.fit.temporal and jobs > 1:
+        say("temporal: each frame starts from the one before, so one process does them all")
+    jobs = 1 if config.fit.temporal else min(jobs or usable_cores(), source.frames or 10**6)
+    frames = list(done)
+    progress(len(frames), source.frames)
+    try:
+        for frame in _fitted(source, config, jobs, skip=len(done)):
+            frames.append(frame)
+            checkpoint.add(frame)
+            progress(len(frames), source.frames)
+    except KeyboardInterrupt:
+        raise Interrupted(_how_to_go_on(len(frames), source.frames, keep, config)) from None
+    except BrokenProcessPool:
+        raise InputError(
+            f"a worker process died after {len(frames)} frames, most likely for want of memory; "
+            "run the same command again with fewer --jobs: finished frames are kept"
+        ) from None
+    finally:
+        checkpoint.flush()
+    for note in source.notes:
+        say(note)
+    if not frames:
+        raise InputError(f"{source.about['input']}: no frame could be made of it; " + "; ".join(source.notes))
+    about = {**source.about, "config": dataclasses.asdict(config), "version": __version__}
+    return Run(tuple(frames), about)
+
+
+def forget_partial(partial: Path) -> None:
+    """Remove the partial results of a run that has been saved."""
+    if partial.is_dir():
+        shutil.rmtree(partial)
+
+
+def run_key(source: Source, config: OfflineConfig) -> str:
+    """Fingerprint of everything that the results depend on."""
+    return fingerprint([__version__, source.identity, dataclasses.asdict(config)])
+
+
+def usable_cores() -> int:
+    """Cores that this process may run on."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _how_to_go_on(done: int, total: int | None, kept: bool, config: OfflineConfig) -> str:
+    text = f"interrupted after {done}{f' of {total}' if total else ''} frames; "
+    if kept:
+        return text + "run the same command again to go on from there"
+    if config.fit.temporal:
+        return text + "a temporal run starts anew, because every frame depends on all before it"
+    return text + "nothing was kept"
+
+
+@dataclass(frozen=True)
+class _Job:
+    """One frame on its way to a worker; masks travel as packed bits."""
+
+    stamp_ns: int
+    packed: dict[str, NDArray[np.uint8]]
+    reason: str
+    stage_ms: dict[str, float]
+
+
+class _Fitter:
+    """One frame at a time: masks -> hull -> pose."""
+
+    def __init__(self, rig: Rig, config: OfflineConfig) -> None:
+        self._widths = {camera.name: camera.width for camera in rig.cameras}
+        self._carver = Carver(rig, config.hull)
+        self._estimator = PoseEstimator(config.fit)
+
+    def fit(self, job: _Job) -> FrameResult:
+        """The result of one frame; the same in whichever process it runs."""
+        if job.reason:
+            return FrameResult(job.stamp_ns, NoPerson(job.reason), job.stage_ms)
+        start = time.process_time()
+        hull = self._carver.carve({name: unpack_mask(bits, self._widths[name]) for name, bits in job.packed.items()})
+        stage_ms = {**job.stage_ms, "hull": 1e3 * (time.process_time() - start)}
+        if isinstance(hull, NoPerson):
+            return FrameResult(job.stamp_ns, hull, stage_ms)
+        outcome = self._estimator.estimate(hull)
+        return FrameResult(job.stamp_ns, outcome, stage_ms)
+
+
+def _fitted(source: Source, config: OfflineConfig, jobs: int, skip: int) -> Iterator[FrameResult]:
+    """Results in the order of the frames, from number `skip` on."""
+    work = (_job(masks) for i, masks in enumerate(source.mask_sets()) if i >= skip)
+    if jobs == 1:
+        cv2.setNumThreads(1)
+        fitter = _Fitter(source.rig, config)
+        yield from map(fitter.fit, work)
+        return
+    # spawn: forked children would inherit the threads' locks of OpenCV and numba
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(jobs, context, _start_worker, (source.rig, config)) as pool:
+        waiting: deque[Future[FrameResult]] = deque()
+        try:
+            for job in work:
+                waiting.append(pool.submit(_work, job))
+                # enough in flight to keep all busy, few enough for a long recording to fit in memory
+                while len(waiting) > 2 * jobs + 2 or (waiting and waiting[0].done()):
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _job(masks: MaskSet) -> _Job:
+    packed = {name: pack_mask(mask) for name, mask in masks.masks.items()}
+    return _Job(masks.stamp_ns, packed, masks.reason, masks.stage_ms)
+
+
+_worker: _Fitter | None = None
+
+
+def _start_worker(rig: Rig, config: OfflineConfig) -> None:
+    global _worker
+    # Ctrl-C reaches the whole process group; the parent decides how to end.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    cv2.setNumThreads(1)
+    _worker = _Fitter(rig, config)
+
+
+def _work(job: _Job) -> FrameResult:
+    assert _worker is not None, "the pool starts every worker with _start_worker"
+    return _worker.fit(job)
