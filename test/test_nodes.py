@@ -5,18 +5,30 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import PoseArray
+from rclpy.parameter import Parameter
 from ros_graph import Graph
-from sensor_msgs.msg import CompressedImage, Image
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_srvs.srv import SetBool, Trigger
 
+from limbloc_ros.core.errors import ConfigError
 from limbloc_ros.nodes.segmentation import SegmentationNode
-from limbloc_ros.ros import topics
-from limbloc_ros.ros.image_messages import message_to_mask, pixels_to_compressed, pixels_to_image
-from limbloc_ros.ros.messages import make_header, stamp_ns
+from limbloc_ros.nodes.simulated_cameras import SimulatedCamerasNode
+from limbloc_ros.rig.rig_file import load_rig
+from limbloc_ros.ros.image_messages import (
+    info_to_camera,
+    message_to_mask,
+    message_to_pixels,
+    pixels_to_compressed,
+    pixels_to_image,
+)
+from limbloc_ros.ros.messages import make_header, message_to_joints, stamp_ns
+from limbloc_ros.simulation.room import SimulatedRoom, default_rig
 
 LEARNING = 4
 FRAME_NS = 33_333_333
@@ -151,9 +163,56 @@ def test_segmentation_says_when_no_camera_is_there(graph: Graph) -> None:
 
 def test_segmentation_takes_live_parameters(graph: Graph) -> None:
     node = graph.add(SegmentationNode, camera="cam0")
-    assert node.settings.camera == "cam0"
-    from rclpy.parameter import Parameter
-
     assert node.set_parameters([Parameter("background.threshold_sigmas", value=9.0)])[0].successful
     assert node.model.config.threshold_sigmas == 9.0
-    assert topics.mask("cam0") == "cam0/mask"
+
+
+# --- simulated cameras ---
+
+
+def test_simulated_cameras_publish_what_the_room_shows(graph: Graph, tmp_path: Path) -> None:
+    rig_file = tmp_path / "rig.yaml"
+    node = graph.add(
+        SimulatedCamerasNode,
+        number_of_cameras=2,
+        width=160,
+        height=120,
+        rate_hz=10.0,
+        empty_s=0.5,
+        transport="both",
+        save_rig=str(rig_file),
+    )
+    raw, jpeg = graph.collect(Image, "cam0/image_raw"), graph.collect(CompressedImage, "cam1/image_raw/compressed")
+    infos, truth = graph.collect(CameraInfo, "cam1/camera_info"), graph.collect(PoseArray, "true_joints")
+    graph.until(lambda: len(raw) > 8 and len(jpeg) > 8 and message_to_joints(truth[-1]) is not None)
+    room = SimulatedRoom(default_rig(2, 160, 120), empty_s=0.5)
+    for msg in (raw[0], raw[-1]):
+        t = (stamp_ns(msg.header) - node.start_ns) / 1e9
+        np.testing.assert_array_equal(message_to_pixels(msg), room.render("cam0", t))
+        assert stamp_ns(msg.header) % 100_000_000 == 0
+    t = (stamp_ns(jpeg[-1].header) - node.start_ns) / 1e9
+    assert np.abs(message_to_pixels(jpeg[-1]).astype(int) - room.render("cam1", t)).mean() < 4
+    t = (stamp_ns(truth[-1].header) - node.start_ns) / 1e9
+    np.testing.assert_array_equal(message_to_joints(truth[-1]), room.joints(t))
+    assert message_to_joints(truth[0]) is None
+    saved = load_rig(rig_file).camera("cam1")
+    received = info_to_camera(infos[-1], "cam1", saved.T_world_camera)
+    np.testing.assert_array_equal(received.K, saved.K)
+    np.testing.assert_array_equal(received.distortion[:4], saved.distortion)
+    assert infos[-1].header.frame_id == "cam1_optical"
+
+
+def test_two_simulation_processes_share_their_instants(graph: Graph) -> None:
+    common = {"number_of_cameras": 2, "width": 64, "height": 64, "rate_hz": 10.0, "start_s": 1_700_000_000.0}
+    first = graph.add(SimulatedCamerasNode, "first", cameras=["cam0"], **common)
+    second = graph.add(SimulatedCamerasNode, "second", cameras=["cam1"], **common)
+    assert first.tells_truth
+    assert not second.tells_truth
+    a, b = graph.collect(Image, "cam0/image_raw"), graph.collect(Image, "cam1/image_raw")
+    graph.until(lambda: len(a) > 3 and len(b) > 3)
+    assert len({stamp_ns(m.header) for m in a} & {stamp_ns(m.header) for m in b}) >= 2
+
+
+def test_simulated_cameras_refuse_a_motion_they_do_not_know(graph: Graph) -> None:
+    with pytest.raises(ConfigError, match="moonwalk"):
+        graph.add(SimulatedCamerasNode, number_of_cameras=2, width=64, height=64, motions=["moonwalk"])

@@ -1,0 +1,160 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A simulated room: camera images, CameraInfo and the person's true joints, as if camera drivers were running.
+
+Stamps are whole multiples of the frame period, so that several processes, each with some of the cameras, deliver
+images of exactly the same instants; give them the same `start_s`.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import PoseArray
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+
+from limbloc_ros.core.config import setting
+from limbloc_ros.rig.rig_file import load_rig, save_rig
+from limbloc_ros.ros import node_main, topics
+from limbloc_ros.ros.health import Health, Meter
+from limbloc_ros.ros.image_messages import camera_to_info, pixels_to_compressed, pixels_to_image
+from limbloc_ros.ros.messages import (
+    NANOSECONDS,
+    OK,
+    WARN,
+    joints_to_message,
+    make_header,
+    make_status,
+    transform_to_message,
+)
+from limbloc_ros.ros.parameters import NodeParameters
+from limbloc_ros.ros.transforms import TransformOutput
+from limbloc_ros.simulation.room import SimulatedRoom, default_rig
+
+
+@dataclass(frozen=True)
+class SimulationSettings:
+    """What the room looks like and which of its cameras this process runs."""
+
+    rig_file: str = setting("", "cameras inside the simulated room; empty: a ring of `number_of_cameras`")
+    number_of_cameras: int = setting(8, "cameras of the ring", low=2, high=16)
+    width: int = setting(640, "image width of the ring's cameras", unit="px", low=64, high=8192)
+    height: int = setting(480, "image height of the ring's cameras", unit="px", low=64, high=8192)
+    save_rig: str = setting("", "write the rig here, for the carving node")
+    cameras: tuple[str, ...] = setting((), "the cameras that this process runs; empty: all")
+    rate_hz: float = setting(15.0, "images per second of each camera", unit="Hz", low=0.1, high=120.0)
+    transport: str = setting("raw", "which image topics there are", choices=("raw", "compressed", "both"))
+    jpeg_quality: int = setting(90, "of compressed images", low=1, high=100, live=True)
+    start_s: float = setting(
+        0.0, "time since the epoch at which the simulation starts; 0: when the node does", unit="s", low=0.0, high=1e11
+    )
+    person: str = setting("man", "who moves", choices=("man", "woman", "child", "heavy"))
+    motions: tuple[str, ...] = setting((), "names of motions in order, repeated for ever; empty: a varied sequence")
+    empty_s: float = setting(2.0, "the room is empty this long at first", unit="s", low=0.0, high=3600.0)
+    noise_sigma: float = setting(2.5, "sensor noise", unit="grey levels", low=0.0, high=25.0)
+    light_drift: float = setting(0.03, "slow change of the light", unit="fraction", low=0.0, high=0.5)
+    seed: int = setting(0, "of textures, motions and noise", low=0, high=2**31 - 1)
+    world_frame: str = setting("room", "TF frame of the world")
+
+
+class SimulatedCamerasNode(Node):
+    """Renders and publishes the cameras of one simulated room."""
+
+    def __init__(self, node_name: str = "simulated_cameras", **node_options: Any) -> None:
+        super().__init__(node_name, **node_options)
+        self.settings = s = NodeParameters(self).declare(SimulationSettings, on_change=self._on_settings)
+        rig = load_rig(s.rig_file) if s.rig_file else default_rig(s.number_of_cameras, s.width, s.height)
+        if s.save_rig:
+            save_rig(rig, s.save_rig)
+        self.cameras = tuple(rig.camera(name) for name in s.cameras or rig.names)
+        # one process tells the truth: the one with the rig's first camera
+        self.tells_truth = self.cameras[0].name == rig.names[0]
+        self.room = SimulatedRoom(rig, s.person, s.seed, s.empty_s, s.motions or None, s.noise_sigma, s.light_drift)
+        self.get_logger().info("painting the room")
+        self.room.warm_up()
+        self.raw = self._image_publishers(Image, topics.image, ("raw", "both"))
+        self.jpeg = self._image_publishers(CompressedImage, topics.image_compressed, ("compressed", "both"))
+        self.infos = {
+            c.name: self.create_publisher(CameraInfo, topics.camera_info(c.name), topics.STREAM_QOS)
+            for c in self.cameras
+        }
+        self.truth = (
+            self.create_publisher(PoseArray, topics.TRUE_JOINTS, topics.STREAM_QOS) if self.tells_truth else None
+        )
+        self.transforms = TransformOutput(self, static=True)
+        self.transforms.send(
+            [
+                transform_to_message(c.T_world_camera, topics.optical_frame(c.name), make_header(0, s.world_frame))
+                for c in self.cameras
+            ]
+        )
+        self.meter, self.render_ms = Meter(), float("nan")
+        self.health = Health(self, self.describe)
+        self.period_ns = round(NANOSECONDS / s.rate_hz)
+        now = self.get_clock().now().nanoseconds
+        self.start_ns = (round(s.start_s * NANOSECONDS) or now) // self.period_ns * self.period_ns
+        self.last_frame = -1
+        # Looks four times per frame whether the next one is due, so that frames come at their stamps' pace.
+        self.create_timer(
+            self.period_ns / 4 / NANOSECONDS, self.on_timer, clock=Clock(clock_type=ClockType.STEADY_TIME)
+        )
+
+    def on_timer(self) -> None:
+        """Publish the newest frame that is due; under load frames are skipped, as a camera driver would."""
+        frame = (self.get_clock().now().nanoseconds - self.start_ns) // self.period_ns
+        if frame > self.last_frame:
+            self.last_frame = frame
+            self.publish(frame)
+
+    def publish(self, frame: int) -> None:
+        """Render and publish one instant."""
+        stamp, t = self.start_ns + frame * self.period_ns, frame * self.period_ns / NANOSECONDS
+        started = time.thread_time()
+        for camera in self.cameras:
+            header = make_header(stamp, topics.optical_frame(camera.name))
+            self.infos[camera.name].publish(camera_to_info(camera, header))
+            raw, jpeg = self.raw.get(camera.name), self.jpeg.get(camera.name)
+            wants_raw = raw is not None and raw.get_subscription_count() > 0
+            wants_jpeg = jpeg is not None and jpeg.get_subscription_count() > 0
+            if not (wants_raw or wants_jpeg):
+                continue
+            pixels = self.room.render(camera.name, t)
+            if wants_raw:
+                raw.publish(pixels_to_image(pixels, header))
+            if wants_jpeg:
+                jpeg.publish(pixels_to_compressed(pixels, header, self.settings.jpeg_quality))
+        if self.truth is not None:
+            self.truth.publish(joints_to_message(self.room.joints(t), make_header(stamp, self.settings.world_frame)))
+        self.render_ms = 1e3 * (time.thread_time() - started)
+        self.meter.tick(self.health.latency_s(stamp))
+
+    def describe(self) -> Sequence[DiagnosticStatus]:
+        """Whether the images keep their pace."""
+        wanted, level, message = self.settings.rate_hz, OK, "filming"
+        if 0 < self.meter.rate_hz < 0.9 * wanted:
+            level, message = WARN, f"only {self.meter.rate_hz:.1f} of {wanted:g} images per second: the machine is busy"
+        values = {
+            "rate_hz": self.meter.rate_hz,
+            "latency_ms": self.meter.latency_ms,
+            "render_ms": self.render_ms,
+            "cameras": " ".join(camera.name for camera in self.cameras),
+        }
+        return [make_status(f"{self.get_name()}: images", level, message, values)]
+
+    def _image_publishers(self, kind: Any, name_topic: Any, transports: Sequence[str]) -> dict[str, Any]:
+        if self.settings.transport not in transports:
+            return {}
+        return {c.name: self.create_publisher(kind, name_topic(c.name), topics.STREAM_QOS) for c in self.cameras}
+
+    def _on_settings(self, settings: SimulationSettings) -> None:
+        self.settings = settings
+
+
+def main() -> int:
+    """Run the simulated cameras."""
+    return node_main.main(SimulatedCamerasNode)
