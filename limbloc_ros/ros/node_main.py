@@ -63,12 +63,17 @@ def spin(
     return False
 
 
-def main(make_nodes: Callable[[], Node | Sequence[Node]], args: Sequence[str] | None = None) -> int:
+def main(
+    make_nodes: Callable[[], Node | Sequence[Node]],
+    args: Sequence[str] | None = None,
+    until: Callable[[], bool] | None = None,
+) -> int:
     """The main function of a process of nodes: init, build, spin, clean shutdown.
 
     Args:
         make_nodes: builds the node, or several to be composed in this process.
         args: command line with ROS arguments; the process's own if None.
+        until: True ends the process (a recording that has been replayed).
 
     Returns:
         exit code: 0 after a clean stop, 1 when a node could not start (the reason is logged).
@@ -79,7 +84,7 @@ def main(make_nodes: Callable[[], Node | Sequence[Node]], args: Sequence[str] | 
     try:
         made = make_nodes()
         nodes = [made] if isinstance(made, Node) else made
-        spin(nodes)
+        spin(nodes, until=until)
     except LimblocError as error:
         get_logger("limbloc").fatal(str(error))
         return 1
