@@ -21,6 +21,9 @@ import numpy as np
 
 from limbloc_ros.simulation.retarget import LINKS
 
+#: Longer clips are cut here: the person must stay in the room.
+MOST_FRAMES = {"punch": 34}
+
 CLIPS = {
     "walk": "0walk_forward",
     "dance": "humanoid3d_dance_b",
@@ -42,9 +45,9 @@ SOURCE = [
 SOURCE_LEG_M = (1.686184 + 1.639480) * 0.25
 
 
-def read_clip(path: Path) -> tuple[float, np.ndarray, np.ndarray]:
+def read_clip(path: Path, most_frames: int | None) -> tuple[float, np.ndarray, np.ndarray]:
     """Frame time s, root positions [F, 3] in leg lengths, link rotations [F, 13, 4]."""
-    frames = np.array(json.loads(path.read_text())["Frames"])
+    frames = np.array(json.loads(path.read_text())["Frames"][:most_frames])
     root = np.stack([frames[:, 1], -frames[:, 3], frames[:, 2]], axis=1) / SOURCE_LEG_M
     rotations, column = {}, 4
     for link, size in SOURCE:
@@ -66,7 +69,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path, help="the folder of DeepMimic's .txt clips")
     parser.add_argument("output", type=Path, help="the .npz file to write")
     args = parser.parse_args()
-    clips = [read_clip(args.folder / f"{source}.txt") for source in CLIPS.values()]
+    clips = [read_clip(args.folder / f"{source}.txt", MOST_FRAMES.get(name)) for name, source in CLIPS.items()]
     np.savez_compressed(
         args.output,
         names=np.array(list(CLIPS)),

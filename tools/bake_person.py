@@ -31,15 +31,15 @@ PEOPLE = {
     "man": (1.79, {"gender": 0.0, "age": 0.64, "muscle": 0.6, "weight": 0.45, "proportions": 0.6}),
     "woman": (1.67, {"gender": 1.0, "age": 0.60, "muscle": 0.45, "weight": 0.45, "proportions": 0.6}),
     "child": (1.32, {"gender": 0.5, "age": 0.37, "muscle": 0.5, "weight": 0.45, "proportions": 0.5}),
-    "heavy": (1.74, {"gender": 0.1, "age": 0.72, "muscle": 0.45, "weight": 0.92, "proportions": 0.5}),
+    "heavy": (1.74, {"gender": 0.4, "age": 0.75, "muscle": 0.3, "weight": 1.0, "proportions": 0.3}),
 }
 
 # Where garments end, as fractions: sleeve along the arm (1 = elbow, 2 = wrist), leg from the ankle up (1 = knee).
 GARMENTS = {
-    "man": {"sleeve": 0.72, "leg": 0.0, "hair": 0.015},
+    "man": {"sleeve": 0.72, "leg": 0.0, "hair": -0.005},
     "woman": {"sleeve": 1.85, "leg": 0.05, "hair": -0.02},
-    "child": {"sleeve": 0.65, "leg": 1.15, "hair": 0.0},
-    "heavy": {"sleeve": 1.85, "leg": 0.0, "hair": 0.03},
+    "child": {"sleeve": 0.65, "leg": 1.15, "hair": -0.01},
+    "heavy": {"sleeve": 1.85, "leg": 0.0, "hair": 0.02},
 }
 
 SPINE = ["root", "spine05", "spine04", "spine03", "spine02", "spine01", "neck01", "neck02", "neck03", "head"]
@@ -70,7 +70,7 @@ class Source:
         """Rest vertices [V, 3] and bone heads [104, 3] in our axes, m; the floor is not at 0 yet."""
         with torch.no_grad():
             out = self.model(phenotype_kwargs={k: torch.tensor([float(v)]) for k, v in phenotype.items()})
-        return tuple(to_ours(out[k][0].double().numpy()) for k in ("rest_vertices", "rest_bone_heads"))  # type: ignore[return-value]
+        return to_ours(out["rest_vertices"][0].double().numpy()), to_ours(out["rest_bone_heads"][0].double().numpy())
 
     def kept_bone(self) -> np.ndarray:
         """[104] index into BONES of the bone that each of Anny's follows."""
@@ -100,7 +100,9 @@ def phenotype_of(source: Source, name: str) -> dict[str, float]:
     return {**phenotype, "height": low}
 
 
-def joints_of(source: Source, weights: np.ndarray, vertices: np.ndarray, heads: np.ndarray) -> list[tuple[str, np.ndarray]]:
+def joints_of(
+    source: Source, weights: np.ndarray, vertices: np.ndarray, heads: np.ndarray
+) -> list[tuple[str, np.ndarray]]:
     """(bone that carries it, rest position) of every joint in JOINT_NAMES; `heads` are all of Anny's."""
 
     def head_of(bone: str) -> np.ndarray:
@@ -144,13 +146,14 @@ def garments_of(name: str, vertices: np.ndarray, heads: np.ndarray, weights: np.
     style = GARMENTS[name]
     head = {bone: heads[i] for i, bone in enumerate(BONES)}
     part = np.array(BONES)[weights.argmax(1)]
-    on_arm = np.array([p.split(".")[0] in ("upperarm01", "upperarm02", "lowerarm01", "lowerarm02", "wrist") for p in part])
-    on_leg = np.array([p.split(".")[0] in ("upperleg01", "upperleg02", "lowerleg01", "lowerleg02", "foot") for p in part])
+    stem = np.array([bone.split(".")[0] for bone in part])
+    on_arm = np.isin(stem, ["upperarm01", "upperarm02", "lowerarm01", "lowerarm02", "wrist"])
+    on_leg = np.isin(stem, ["upperleg01", "upperleg02", "lowerleg01", "lowerleg02", "foot"])
     on_head = np.isin(part, ["head", "neck02", "neck03"])
     fields = np.full((len(vertices), 4), -0.15)
 
     skull = (head["head"] + [0.02, 0, 0.07]).astype(float)
-    up_and_back = np.array([-0.75, 0.0, 0.66])
+    up_and_back = np.array([-0.5, 0.0, 0.866])
     fields[on_head, 0] = (vertices[on_head] - skull) @ up_and_back - style["hair"]
 
     hem = head["root"][2] - 0.03
@@ -209,8 +212,6 @@ def main() -> None:
         people["joint_rest"].append(np.array([position for _, position in joints]) - floor)
         people["garments"].append(garments_of(name, vertices - floor, heads[kept] - floor, weights))
         print(f"{name}: stature {np.ptp(detailed_vertices[:, 2]):.3f} m, {len(vertices)} vertices")
-        for joint in ("head_centre", "torso_centre", "shoulder_L", "wrist_L", "fingertip_L", "ankle_L", "toe_L", "heel_L"):
-            print(f"  {joint:12s}", (joints[JOINT_NAMES.index(joint)][1] - floor).round(3))
 
     np.savez_compressed(
         output,
@@ -221,7 +222,7 @@ def main() -> None:
         skin_bones=order.astype(np.uint8),
         skin_weights=quantised.astype(np.uint8),
         joint_bones=np.array([BONES.index(bone) for bone, _ in joints], dtype=np.uint8),
-        **{key: np.array(value, dtype=np.float16 if key == "garments" else np.float32) for key, value in people.items()},
+        **{k: np.array(v, dtype=np.float16 if k == "garments" else np.float32) for k, v in people.items()},
     )
     print(f"{output}: {output.stat().st_size / 1000:.0f} kB")
 

@@ -10,13 +10,18 @@ import math
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Quaternion = tuple[float, float, float, float]
 
 #: How a bone takes part in the rotation of its link.
 SHARE, HALF_TWIST, SWING_SHARE = 0, 1, 2
 
 
 @njit(cache=True)
-def chain(heads, parents, rotations, root, positions):
+def chain(heads: Array, parents: Ints, rotations: Array, root: Array, positions: Array) -> None:
     """Bone head positions [B, 3] in the world; `rotations` [B, 3, 3] are rest -> world."""
     positions[0] = root
     for b in range(1, len(parents)):
@@ -29,7 +34,9 @@ def chain(heads, parents, rotations, root, positions):
 
 
 @njit(cache=True)
-def skin(rest, bones, weights, heads, rotations, positions, out):
+def skin(
+    rest: Array, bones: Ints, weights: Array, heads: Array, rotations: Array, positions: Array, out: Array
+) -> None:
     """Linear blend skinning: out [V, 3] = sum over four bones of w (position + R (rest - head))."""
     n = len(heads)
     shift = np.empty((n, 3))
@@ -54,7 +61,7 @@ def skin(rest, bones, weights, heads, rotations, positions, out):
 
 
 @njit(cache=True)
-def _multiply(a, b):
+def _multiply(a: Quaternion, b: Quaternion) -> Quaternion:
     return (
         a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
         a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],
@@ -64,7 +71,7 @@ def _multiply(a, b):
 
 
 @njit(cache=True)
-def _power(q, f):
+def _power(q: Quaternion, f: float) -> Quaternion:
     """The fraction f of the rotation q, along the shorter arc."""
     w, x, y, z = q
     if w < 0.0:
@@ -78,7 +85,7 @@ def _power(q, f):
 
 
 @njit(cache=True)
-def _twist(q):
+def _twist(q: Quaternion) -> Quaternion:
     """The part of q that turns about z (the axis of a hanging limb): q = swing * twist."""
     n = math.sqrt(q[0] * q[0] + q[3] * q[3])
     if n < 1e-6:
@@ -87,7 +94,10 @@ def _twist(q):
 
 
 @njit(cache=True)
-def bones_of_links(local, link_parents, bone_links, bone_modes, bone_fractions, to_neutral, out):
+def bones_of_links(
+    local: Array, link_parents: Ints, bone_links: Ints, bone_modes: Ints, bone_fractions: Array, to_neutral: Array,
+    out: Array,
+) -> None:  # fmt: skip
     """Bone rotations rest -> world [B, 3, 3] from the links' rotations relative to their parents [L, 4].
 
     A bone takes a part of its link's rotation (a spine bone a fraction, the upper half of a limb half of the twist, a

@@ -10,10 +10,39 @@ import math
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.float32]
+Faces = NDArray[np.int32]
+Image = NDArray[np.uint8]
 
 
-@njit(cache=True)
-def shade_vertices(vertices, faces, light, tone, shade):
+@njit(cache=True, error_model="numpy")
+def project(points: Array, R: Array, t: Array, K: Array, k: Array, uv: Array, depth: Array) -> None:
+    """World points [V, 3] -> uv [V, 2] px and depth [V] m, with OpenCV's distortion k1 k2 p1 p2 k3 k4 k5 k6.
+
+    The same as Camera.world_to_image for `none`, `radtan` and `rational` up to 8 coefficients; R, t are T_camera_world.
+    """
+    for v in range(len(points)):
+        X, Y, Z = points[v, 0], points[v, 1], points[v, 2]
+        z = R[2, 0] * X + R[2, 1] * Y + R[2, 2] * Z + t[2]
+        depth[v] = z
+        if z <= 1e-6:
+            uv[v, 0] = uv[v, 1] = np.nan
+            continue
+        x = (R[0, 0] * X + R[0, 1] * Y + R[0, 2] * Z + t[0]) / z
+        y = (R[1, 0] * X + R[1, 1] * Y + R[1, 2] * Z + t[1]) / z
+        r2 = x * x + y * y
+        radial = (1 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))) / (1 + r2 * (k[5] + r2 * (k[6] + r2 * k[7])))
+        xd = x * radial + 2 * k[2] * x * y + k[3] * (r2 + 2 * x * x)
+        yd = y * radial + k[2] * (r2 + 2 * y * y) + 2 * k[3] * x * y
+        uv[v, 0] = K[0, 0] * xd + K[0, 1] * yd + K[0, 2]
+        uv[v, 1] = K[1, 1] * yd + K[1, 2]
+
+
+@njit(cache=True, error_model="numpy")
+def shade_vertices(vertices: Array, faces: Faces, light: Array, tone: Array, shade: Array) -> None:
     """Gouraud shading [V]: light from above and a lamp in the direction `light`, times each vertex' own `tone`."""
     n = len(vertices)
     normals = np.zeros((n, 3))
@@ -33,8 +62,11 @@ def shade_vertices(vertices, faces, light, tone, shade):
         shade[v] = (0.52 + 0.14 * z * s + 0.46 * lamp) * tone[v]
 
 
-@njit(cache=True)
-def rasterise(uv, depth, faces, shade, garments, stripe, palette, near, image, mask, zbuffer, x0, y0, x1, y1):
+@njit(cache=True, error_model="numpy")
+def rasterise(
+    uv: Array, depth: Array, faces: Faces, shade: Array, garments: Array, stripe: Array, palette: Array, near: float,
+    image: Image, mask: Image, zbuffer: Floats, x0: int, y0: int, x1: int, y1: int,
+) -> None:  # fmt: skip
     """Draw the triangles that face the camera into `image` and `mask` (255), nearest first by `zbuffer`.
 
     uv [V, 2] px, depth [V] m, shade [V], garments [V, 4] (see person.GARMENTS), stripe [V] rest height m for the
@@ -54,46 +86,70 @@ def rasterise(uv, depth, faces, shade, garments, stripe, palette, near, image, m
         area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
         if area >= -1e-9:  # image y points down: a face seen from outside has a negative area
             continue
-        left = max(int(math.ceil(min(ax, bx, cx))), x0)
-        right = min(int(math.floor(max(ax, bx, cx))), x1 - 1)
-        top = max(int(math.ceil(min(ay, by, cy))), y0)
-        bottom = min(int(math.floor(max(ay, by, cy))), y1 - 1)
+        left = max(math.ceil(min(ax, bx, cx)), x0)
+        right = min(math.floor(max(ax, bx, cx)), x1 - 1)
+        top = max(math.ceil(min(ay, by, cy)), y0)
+        bottom = min(math.floor(max(ay, by, cy)), y1 - 1)
         if left > right or top > bottom:
             continue
         inv = 1.0 / area
         wa_dx, wb_dx = -(cy - by) * inv, -(ay - cy) * inv
         za, zb, zc = 1.0 / depth[a], 1.0 / depth[b], 1.0 / depth[c]
+        wc_dx = -wa_dx - wb_dx
         for y in range(top, bottom + 1):
             wa = ((cx - bx) * (y - by) - (cy - by) * (left - bx)) * inv
             wb = ((ax - cx) * (y - cy) - (ay - cy) * (left - cx)) * inv
-            for x in range(left, right + 1):
+            wc = 1.0 - wa - wb
+            # The pixels of this row that lie inside: every weight is linear along it.
+            first, last = 0.0, float(right - left)
+            if wa_dx > 0:
+                first = max(first, -wa / wa_dx)
+            elif wa_dx < 0:
+                last = min(last, -wa / wa_dx)
+            elif wa < 0:
+                continue
+            if wb_dx > 0:
+                first = max(first, -wb / wb_dx)
+            elif wb_dx < 0:
+                last = min(last, -wb / wb_dx)
+            elif wb < 0:
+                continue
+            if wc_dx > 0:
+                first = max(first, -wc / wc_dx)
+            elif wc_dx < 0:
+                last = min(last, -wc / wc_dx)
+            elif wc < 0:
+                continue
+            begin, end = math.ceil(first - 1e-9), math.floor(last + 1e-9)
+            wa += begin * wa_dx
+            wb += begin * wb_dx
+            for x in range(left + begin, left + end + 1):
                 wc = 1.0 - wa - wb
-                if wa >= -1e-9 and wb >= -1e-9 and wc >= -1e-9:
-                    z = wa * za + wb * zb + wc * zc
-                    if z > zbuffer[y, x]:
-                        zbuffer[y, x] = z
-                        s = wa * shade[a] + wb * shade[b] + wc * shade[c]
-                        kind = 0
-                        if wa * garments[a, 3] + wb * garments[b, 3] + wc * garments[c, 3] > 0:
-                            kind = 4
-                        elif wa * garments[a, 1] + wb * garments[b, 1] + wc * garments[c, 1] > 0:
-                            kind = 2
-                            height = wa * stripe[a] + wb * stripe[b] + wc * stripe[c]
-                            if (height * 14.0) % 1.0 < 0.3:
-                                s *= 0.86
-                        elif wa * garments[a, 2] + wb * garments[b, 2] + wc * garments[c, 2] > 0:
-                            kind = 3
-                        elif wa * garments[a, 0] + wb * garments[b, 0] + wc * garments[c, 0] > 0:
-                            kind = 1
-                        for k in range(3):
-                            image[y, x, k] = min(int(palette[kind, k] * s + 0.5), 255)
-                        mask[y, x] = 255
+                z = wa * za + wb * zb + wc * zc
+                if z > zbuffer[y, x]:
+                    zbuffer[y, x] = z
+                    s = wa * shade[a] + wb * shade[b] + wc * shade[c]
+                    kind = 0
+                    if wa * garments[a, 3] + wb * garments[b, 3] + wc * garments[c, 3] > 0:
+                        kind = 4
+                    elif wa * garments[a, 1] + wb * garments[b, 1] + wc * garments[c, 1] > 0:
+                        kind = 2
+                        height = wa * stripe[a] + wb * stripe[b] + wc * stripe[c]
+                        if height * 14.0 - math.floor(height * 14.0) < 0.3:
+                            s *= 0.86
+                    elif wa * garments[a, 2] + wb * garments[b, 2] + wc * garments[c, 2] > 0:
+                        kind = 3
+                    elif wa * garments[a, 0] + wb * garments[b, 0] + wc * garments[c, 0] > 0:
+                        kind = 1
+                    for k in range(3):
+                        image[y, x, k] = min(int(palette[kind, k] * s + 0.5), 255)
+                    mask[y, x] = 255
                 wa += wa_dx
                 wb += wb_dx
 
 
-@njit(cache=True)
-def soften_edges(image, copy, mask, x0, y0, x1, y1):
+@njit(cache=True, error_model="numpy")
+def soften_edges(image: Image, copy: Image, mask: Image, x0: int, y0: int, x1: int, y1: int) -> None:
     """Blur the silhouette's edge by 3 x 3 (1 2 1), as a lens and a sensor do; `copy` is image[y0:y1, x0:x1] before."""
     for y in range(y0 + 1, y1 - 1):
         for x in range(x0 + 1, x1 - 1):
@@ -102,19 +158,15 @@ def soften_edges(image, copy, mask, x0, y0, x1, y1):
                 continue
             i, j = y - y0, x - x0
             for k in range(3):
-                total = (
-                    4 * int(copy[i, j, k])
-                    + 2 * (int(copy[i - 1, j, k]) + int(copy[i + 1, j, k]) + int(copy[i, j - 1, k]) + int(copy[i, j + 1, k]))
-                    + int(copy[i - 1, j - 1, k])
-                    + int(copy[i - 1, j + 1, k])
-                    + int(copy[i + 1, j - 1, k])
-                    + int(copy[i + 1, j + 1, k])
-                )
-                image[y, x, k] = (total + 8) // 16
+                total = 8
+                for di in range(-1, 2):
+                    for dj in range(-1, 2):
+                        total += int(copy[i + di, j + dj, k]) * (2 - abs(di)) * (2 - abs(dj))
+                image[y, x, k] = total // 16
 
 
-@njit(cache=True)
-def cover_floor(points, heights, faces, fade_m, x0, y0, cover):
+@njit(cache=True, error_model="numpy")
+def cover_floor(points: Array, heights: Array, faces: Faces, fade_m: float, x0: int, y0: int, cover: Floats) -> None:
     """Rasterise a mesh that was projected onto the floor; cover [h, w] float32 becomes 1 under it.
 
     points [V, 2] in cells; a face's cover falls with its height above the floor, to 0 at `fade_m` m.
@@ -131,8 +183,8 @@ def cover_floor(points, heights, faces, fade_m, x0, y0, cover):
         area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
         if area <= 1e-9:  # the half of the mesh that faces the light is enough
             continue
-        left, right = max(int(math.ceil(min(ax, bx, cx))), 0), min(int(math.floor(max(ax, bx, cx))), w - 1)
-        top, bottom = max(int(math.ceil(min(ay, by, cy))), 0), min(int(math.floor(max(ay, by, cy))), h - 1)
+        left, right = max(math.ceil(min(ax, bx, cx)), 0), min(math.floor(max(ax, bx, cx)), w - 1)
+        top, bottom = max(math.ceil(min(ay, by, cy)), 0), min(math.floor(max(ay, by, cy)), h - 1)
         inv = 1.0 / area
         for y in range(top, bottom + 1):
             for x in range(left, right + 1):
@@ -142,8 +194,10 @@ def cover_floor(points, heights, faces, fade_m, x0, y0, cover):
                     cover[y, x] = value
 
 
-@njit(cache=True)
-def darken_floor(image, floor, light, cell_x0, cell_y0, x0, y0, x1, y1):
+@njit(cache=True, error_model="numpy")
+def darken_floor(
+    image: Image, floor: Floats, light: Floats, cell_x0: int, cell_y0: int, x0: int, y0: int, x1: int, y1: int
+) -> None:
     """Multiply floor pixels by `light` [h, w] (1 = no shadow), bilinear; floor [H, W, 2] are the pixels' cells."""
     h, w = light.shape
     for y in range(y0, y1):
@@ -161,8 +215,8 @@ def darken_floor(image, floor, light, cell_x0, cell_y0, x0, y0, x1, y1):
                     image[y, x, k] = int(image[y, x, k] * value + 0.5)
 
 
-@njit(cache=True)
-def expose(image, gain, noise, key, out):
+@njit(cache=True, error_model="numpy")
+def expose(image: Image, gain: float, noise: NDArray[np.int8], key: np.uint64, out: Image) -> None:
     """out = image * gain + noise, rounded and clipped; each row takes its noise from elsewhere in the bank `noise`.
 
     `key` uint64 chooses the places; the bank is int8 with at least as many values as a row.

@@ -49,7 +49,7 @@ class Action:
 
 
 STAND: dict[str, tuple[float, ...]] = {
-    **{link: (0.0, 0.0, 0.0) for link in ("root", "chest", "neck")},
+    **dict.fromkeys(("root", "chest", "neck"), (0.0, 0.0, 0.0)),
     **{f"hip_{s}": (4.0, 1.0, 0.0) for s in "LR"},
     **{f"knee_{s}": (6.0,) for s in "LR"},
     **{f"shoulder_{s}": (4.0, 4.0, 0.0) for s in "LR"},
@@ -63,8 +63,15 @@ def both(**angles: tuple[float, ...]) -> dict[str, tuple[float, ...]]:
 
 
 _WAVE_ARM = {"shoulder_R": (15.0, 100.0, 80.0)}
-_SQUAT = {"root": (22.0, 0.0, 0.0), **both(hip=(98.0, 14.0, 8.0), knee=(104.0,), shoulder=(75.0, 8.0, 0.0), elbow=(20.0,))}
-_SIT = {"root": (6.0, 0.0, 0.0), "chest": (8.0, 0.0, 0.0), **both(hip=(82.0, 9.0, 4.0), knee=(80.0,), shoulder=(30.0, 4.0, -10.0), elbow=(52.0,))}  # fmt: skip
+_SQUAT = {
+    "root": (22.0, 0.0, 0.0),
+    **both(hip=(98.0, 14.0, 8.0), knee=(104.0,), shoulder=(75.0, 8.0, 0.0), elbow=(20.0,)),
+}
+_SIT = {
+    "root": (6.0, 0.0, 0.0),
+    "chest": (8.0, 0.0, 0.0),
+    **both(hip=(82.0, 9.0, 4.0), knee=(80.0,), shoulder=(30.0, 4.0, -10.0), elbow=(52.0,)),
+}
 _HIPS = both(shoulder=(-24.0, 42.0, -48.0), elbow=(82.0,))
 
 # name -> [(seconds from the key before, key), ...]; the first and the last key are standing.
@@ -82,14 +89,55 @@ AUTHORED: dict[str, Sequence[tuple[float, Key]]] = {
         (0.7, {}),
     ],
     "reach": [
-        (0.9, {"chest": (-4.0, -8.0, 18.0), "neck": (-18.0, 0.0, 10.0), "shoulder_R": (150.0, 10.0, 0.0), "elbow_R": (12.0,)}),
-        (0.7, {"chest": (-4.0, -8.0, 22.0), "neck": (-18.0, 0.0, 10.0), "shoulder_R": (158.0, 8.0, 0.0), "elbow_R": (5.0,)}),
-        (1.1, {"root": (22.0, 0.0, 0.0), "chest": (28.0, 8.0, -28.0), "neck": (10.0, 0.0, 0.0), "shoulder_L": (88.0, 4.0, 0.0), "elbow_L": (10.0,), **both(hip=(52.0, 4.0, 0.0), knee=(42.0,))}),  # fmt: skip
-        (0.6, {"root": (24.0, 0.0, 0.0), "chest": (30.0, 8.0, -30.0), "neck": (10.0, 0.0, 0.0), "shoulder_L": (92.0, 4.0, 0.0), "elbow_L": (5.0,), **both(hip=(56.0, 4.0, 0.0), knee=(46.0,))}),  # fmt: skip
+        (
+            0.9,
+            {
+                "chest": (-4.0, -8.0, 18.0),
+                "neck": (-18.0, 0.0, 10.0),
+                "shoulder_R": (150.0, 10.0, 0.0),
+                "elbow_R": (12.0,),
+            },
+        ),
+        (
+            0.7,
+            {
+                "chest": (-4.0, -8.0, 22.0),
+                "neck": (-18.0, 0.0, 10.0),
+                "shoulder_R": (158.0, 8.0, 0.0),
+                "elbow_R": (5.0,),
+            },
+        ),
+        (
+            1.1,
+            {
+                "root": (22.0, 0.0, 0.0),
+                "chest": (28.0, 8.0, -28.0),
+                "neck": (10.0, 0.0, 0.0),
+                "shoulder_L": (88.0, 4.0, 0.0),
+                "elbow_L": (10.0,),
+                **both(hip=(52.0, 4.0, 0.0), knee=(42.0,)),
+            },
+        ),
+        (
+            0.6,
+            {
+                "root": (24.0, 0.0, 0.0),
+                "chest": (30.0, 8.0, -30.0),
+                "neck": (10.0, 0.0, 0.0),
+                "shoulder_L": (92.0, 4.0, 0.0),
+                "elbow_L": (5.0,),
+                **both(hip=(56.0, 4.0, 0.0), knee=(46.0,)),
+            },
+        ),
         (1.0, {}),
     ],
     "squat": [(1.0, _SQUAT), (0.35, _SQUAT), (0.9, {}), (0.9, _SQUAT), (1.0, {})],
-    "sit": [(1.1, _SIT), (0.7, {**_SIT, "neck": (0.0, 0.0, 35.0)}), (0.7, {**_SIT, "neck": (0.0, 0.0, -25.0)}), (1.1, {})],
+    "sit": [
+        (1.1, _SIT),
+        (0.7, {**_SIT, "neck": (0.0, 0.0, 35.0)}),
+        (0.7, {**_SIT, "neck": (0.0, 0.0, -25.0)}),
+        (1.1, {}),
+    ],
     "stretch": [
         (0.8, _HIPS),
         (0.8, {**_HIPS, "chest": (0.0, 22.0, 0.0), "root": (0.0, 4.0, 0.0)}),
@@ -99,13 +147,23 @@ AUTHORED: dict[str, Sequence[tuple[float, Key]]] = {
         (0.9, {}),
     ],
     "point": [
-        (0.7, {"shoulder_L": (88.0, 20.0, 0.0), "elbow_L": (6.0,), "neck": (0.0, 0.0, 15.0), "chest": (0.0, 0.0, -8.0)}),
-        (0.9, {"shoulder_L": (92.0, 55.0, 0.0), "elbow_L": (6.0,), "neck": (0.0, 0.0, 40.0), "chest": (0.0, 0.0, 10.0)}),
+        (
+            0.7,
+            {"shoulder_L": (88.0, 20.0, 0.0), "elbow_L": (6.0,), "neck": (0.0, 0.0, 15.0), "chest": (0.0, 0.0, -8.0)},
+        ),
+        (
+            0.9,
+            {"shoulder_L": (92.0, 55.0, 0.0), "elbow_L": (6.0,), "neck": (0.0, 0.0, 40.0), "chest": (0.0, 0.0, 10.0)},
+        ),
         (0.8, {"shoulder_L": (84.0, 30.0, 0.0), "elbow_L": (60.0,), "neck": (0.0, 0.0, 10.0)}),
         (0.7, {}),
     ],
-    "t_pose": [(0.9, both(shoulder=(0.0, 84.0, 0.0), elbow=(4.0,))), (0.7, both(shoulder=(0.0, 86.0, 0.0), elbow=(4.0,))), (0.9, {})],
-}  # fmt: skip
+    "t_pose": [
+        (0.9, both(shoulder=(0.0, 84.0, 0.0), elbow=(4.0,))),
+        (0.7, both(shoulder=(0.0, 86.0, 0.0), elbow=(4.0,))),
+        (0.9, {}),
+    ],
+}
 
 
 def _link_rotations(angles: Mapping[str, Array]) -> Array:

@@ -73,7 +73,7 @@ class Motion:
             order[3:] = rng.permutation(order[3:]).tolist()
         self.person = person
         self.empty_s = float(empty_s)
-        self._retarget = Retarget(person, arm_gap_rad=0.24 if person.name == "heavy" else 0.12)
+        self._retarget = Retarget(person, arm_gap_rad=0.20 if person.name == "heavy" else 0.07)
         self._clearances: dict[str, Array] = {}
         self._last: tuple[float, PosedPerson] | None = None
         self._lay_out(order, rng)
@@ -118,7 +118,7 @@ class Motion:
         posed = self.person.pose(self._retarget.bone_rotations(rotations), np.array([xy[0], xy[1], 0.0]))
         return posed.moved([0.0, 0.0, clearance - posed.vertices[:, 2].min()])
 
-    # ---- laying out the track -------------------------------------------------------------------------------------
+    # ---- laying out the track ----
 
     def _lay_out(self, order: list[str], rng: np.random.Generator) -> None:
         actions = all_actions()
@@ -127,7 +127,7 @@ class Motion:
         pieces = [entrance]
         place, heading = entrance.path[-1], float(quat.heading(entrance.rotations[-1, 0]))
         home = (place, heading)
-        for name in order:
+        for name, following in zip(order, [*order[1:], None], strict=True):
             action = actions[name]
             turned = self._best_heading(action, place, heading)
             if abs(_wrapped(turned - heading)) > 0.3:
@@ -135,10 +135,13 @@ class Motion:
                 heading = float(quat.heading(pieces[-1].rotations[-1, 0]))
             pieces.append(self._place(action, place, heading))
             place, heading = pieces[-1].path[-1], float(quat.heading(pieces[-1].rotations[-1, 0]))
-            angle = math.atan2(place[1], place[0]) + rng.uniform(0.6 * math.pi, 1.4 * math.pi)
-            target = rng.uniform(0.3, 0.65) * np.array([math.cos(angle), math.sin(angle)])
-            if name == order[-1]:
-                target = home[0]
+            target = home[0]
+            if following is not None:
+                # Across the room, and as far from its middle as lets the next motion pass through the middle.
+                span = np.linalg.norm(actions[following].path[:, None] - actions[following].path[None], axis=-1).max()
+                radius = float(np.clip(span * self.person.leg_m / 2, rng.uniform(0.25, 0.55), 0.7))
+                angle = math.atan2(place[1], place[0]) + rng.uniform(0.6 * math.pi, 1.4 * math.pi)
+                target = radius * np.array([math.cos(angle), math.sin(angle)])
             pieces.append(self._walk(place, heading, target))
             place, heading = pieces[-1].path[-1], float(quat.heading(pieces[-1].rotations[-1, 0]))
         pieces.append(self._turn(place, heading, home[1]))
@@ -187,9 +190,8 @@ class Motion:
     def _planted(self, rotations: Array) -> Array:
         """[F, 2] how the root moves while the middle between the ankles stays, starting at 0."""
         ankles = [self.person.bone("foot.L"), self.person.bone("foot.R")]
-        between = np.array(
-            [self.person.pose(self._retarget.bone_rotations(q), np.zeros(3)).bone_positions[ankles, :2].mean(0) for q in rotations]
-        )
+        bones = (self._retarget.bone_rotations(q) for q in rotations)
+        between = np.array([self.person.pose(b, np.zeros(3)).bone_positions[ankles, :2].mean(0) for b in bones])
         return np.asarray(between[0] - between)
 
     def _best_heading(self, action: Action, place: Array, heading: float) -> float:
@@ -210,7 +212,10 @@ class Motion:
         stride = float(cycle.path[-1, 0]) * self.person.leg_m * (length / (length - 1))
         speed_m = _WALK_PACE * stride / (length / RATE)
         at, phase, pace = np.array(place, dtype=np.float64), 0.0, 0.3
-        phases, places, headings, vigours = [], [], [], []
+        phases: list[float] = []
+        places: list[Array] = []
+        headings: list[float] = []
+        vigours: list[float] = []
         while len(places) < 20 * RATE:
             way = target - at
             distance = float(np.linalg.norm(way))
@@ -235,8 +240,8 @@ class Motion:
         """Turn on the spot with small steps."""
         change = _wrapped(wanted - heading)
         n = max(round(abs(change) / _TURN_RATE * RATE * 1.4), 8)
-        headings = heading + change * _smooth(np.arange(1, n + 1) / n)
-        phases = np.arange(n) * _WALK_PACE % len(all_actions()["walk"].path)
+        headings = heading + change * _smooth(np.arange(1.0, n + 1) / n)
+        phases = np.arange(float(n)) * _WALK_PACE % len(all_actions()["walk"].path)
         return self._stepping("turn", phases, np.tile(place, (n, 1)), headings, np.full(n, 0.4))
 
     def _stepping(self, name: str, phases: Array, places: Array, headings: Array, vigours: Array) -> _Piece:

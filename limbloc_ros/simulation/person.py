@@ -30,7 +30,7 @@ def baked(name: str) -> dict[str, NDArray[np.generic]]:
     """The arrays of the package's data file `name`, without pickled objects."""
     with resources.as_file(resources.files("limbloc_ros.simulation") / "data" / name) as path:
         if not path.is_file():
-            raise InputError(f"the package lacks its data file {path}; expected it beside the code: reinstall limbloc_ros")
+            raise InputError(f"{path}: expected this data file beside the code, it is missing: reinstall limbloc_ros")
         with np.load(path, allow_pickle=False) as file:
             return {key: file[key] for key in file.files}
 
@@ -122,9 +122,7 @@ class Person:
             self.bone_heads, self.bone_parents, rotations, np.asarray(root_position, dtype=np.float64), positions
         )
         vertices = np.empty_like(self.vertices)
-        kernels.skin(
-            self.vertices, self.skin_bones, self.skin_weights, self.bone_heads, rotations, positions, vertices
-        )
+        kernels.skin(self.vertices, self.skin_bones, self.skin_weights, self.bone_heads, rotations, positions, vertices)
         carrier = self.joint_bones
         arms = self.joint_rest - self.bone_heads[carrier]
         joints = positions[carrier] + np.einsum("jik,jk->ji", rotations[carrier], arms)

@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from limbloc_ros.core.camera import Camera
 
 Image = NDArray[np.uint8]
+Floats = NDArray[np.float32]
+Colour = tuple[float, float, float]
 
 #: The room is a box: walls at +-HALF_M on x and y, the floor at 0, the ceiling at HEIGHT_M.
 HALF_M = 3.0
@@ -31,10 +33,11 @@ def _size(metres: float) -> int:
     return round(metres / TEXEL_M)
 
 
-def _cloud(rng: np.random.Generator, shape: tuple[int, int], grain_m: tuple[float, float], strength: float) -> NDArray[np.float32]:
+def _cloud(rng: np.random.Generator, shape: tuple[int, ...], grain_m: tuple[float, float], strength: float) -> Floats:
     """Smooth random variation [h, w] of about +-strength; grain_m is its size down and across."""
-    small = rng.normal(0, strength, [max(2, round(n * TEXEL_M / g)) for n, g in zip(shape, grain_m, strict=True)])
-    return np.asarray(cv2.resize(small.astype(np.float32), shape[::-1], interpolation=cv2.INTER_CUBIC))
+    size = [max(2, round(n * TEXEL_M / g)) for n, g in zip(shape, grain_m, strict=True)]
+    small = np.asarray(rng.normal(0, strength, size), dtype=np.float32)
+    return np.asarray(cv2.resize(small, shape[::-1], interpolation=cv2.INTER_CUBIC))
 
 
 def _floor(rng: np.random.Generator) -> Image:
@@ -51,7 +54,7 @@ def _floor(rng: np.random.Generator) -> Image:
     image *= (1 + _cloud(rng, (n, n), (0.012, 0.25), 0.05) + _cloud(rng, (n, n), (0.5, 0.5), 0.03))[..., None]
     y, x = np.mgrid[:n, :n].astype(np.float32) * np.float32(TEXEL_M) - np.float32(HALF_M)
     radius = np.hypot(x, y)
-    rug = np.where((radius < 1.25)[..., None], np.float32([104, 98, 110]), image)
+    rug = np.where((radius < 1.25)[..., None], np.array([104, 98, 110], np.float32), image)
     rug[(np.abs(radius - 1.1) < 0.03) | (np.abs(radius - 0.55) < 0.02)] = (120, 128, 140)
     weave = 1 + 0.035 * np.sin(x * 180) * np.sin(y * 180) + _cloud(rng, (n, n), (0.02, 0.02), 0.03)
     image = np.where((radius < 1.25)[..., None], rug * weave[..., None], image)
@@ -62,23 +65,27 @@ def _floor(rng: np.random.Generator) -> Image:
 def _wall(rng: np.random.Generator, index: int) -> Image:
     """Wall `index` seen from inside; row 0 is the ceiling, columns go along +y or +x."""
     h, w = _size(HEIGHT_M), _size(2 * HALF_M)
-    image = np.tile(np.float32(_WALLS[index]), (h, w, 1))
+    image = np.tile(np.array(_WALLS[index], dtype=np.float32), (h, w, 1))
     image *= (1 + _cloud(rng, (h, w), (0.6, 0.6), 0.025) + _cloud(rng, (h, w), (0.03, 0.03), 0.012))[..., None]
 
-    def box(along_m: float, low_m: float, width_m: float, height_m: float, colour: tuple[float, float, float]) -> NDArray[np.float32]:
+    def box(along_m: float, low_m: float, width_m: float, height_m: float, colour: Colour) -> Floats:
         x, y = _size(along_m + HALF_M), h - _size(low_m + height_m)
         area = image[y : y + _size(height_m), x : x + _size(width_m)]
         area[:] = colour
         return area
 
+    def paint(darkest: float) -> Colour:
+        blue, green, red = rng.uniform(darkest, 190, 3)
+        return float(blue), float(green), float(red)
+
     def picture(along_m: float, low_m: float, width_m: float, height_m: float, frame: float) -> None:
         box(along_m, low_m, width_m, height_m, (frame, frame, frame))
-        inner = box(along_m + 0.04, low_m + 0.04, width_m - 0.08, height_m - 0.08, tuple(rng.uniform(60, 190, 3)))
+        inner = box(along_m + 0.04, low_m + 0.04, width_m - 0.08, height_m - 0.08, paint(60))
         inner *= 1 + _cloud(rng, inner.shape[:2], (0.25, 0.25), 0.25)[..., None]
 
     if index == 0:
         box(DOOR_Y_M - DOOR_SIZE_M[0] / 2 - 0.07, 0, DOOR_SIZE_M[0] + 0.14, DOOR_SIZE_M[1] + 0.07, (196, 202, 204))
-        box(DOOR_Y_M - DOOR_SIZE_M[0] / 2, 0, *DOOR_SIZE_M, (58, 60, 62))
+        box(DOOR_Y_M - DOOR_SIZE_M[0] / 2, 0, DOOR_SIZE_M[0], DOOR_SIZE_M[1], (58, 60, 62))
         picture(1.2, 1.2, 0.9, 0.65, 70)
     elif index == 1:
         box(-1.1, 0.95, 2.1, 1.35, (150, 158, 160))
@@ -94,14 +101,14 @@ def _wall(rng: np.random.Generator, index: int) -> Image:
             at = -0.86
             while at < 0.7:
                 width, height = rng.uniform(0.03, 0.07), rng.uniform(0.2, 0.33)
-                box(at, 0.785 + 0.42 * shelf, width, height, tuple(rng.uniform(50, 190, 3)))
+                box(at, 0.785 + 0.42 * shelf, width, height, paint(50))
                 at += width + (rng.uniform(0.1, 0.3) if rng.random() < 0.2 else 0.003)
         picture(1.5, 1.2, 0.6, 0.8, 90)
     skirting = image[h - _size(0.09) :]
     skirting[:] = np.where((skirting.mean(-1) > 80)[..., None], (188, 192, 196), skirting)
-    height = np.linspace(HEIGHT_M, 0, h, dtype=np.float32)[:, None]
+    up = np.linspace(HEIGHT_M, 0, h, dtype=np.float32)[:, None]
     along = np.linspace(-HALF_M, HALF_M, w, dtype=np.float32)[None]
-    light = 0.78 + 0.22 * np.exp(-((height - 1.6) ** 2) / 2.5 - (along - 0.4) ** 2 / 6.0)
+    light = 0.78 + 0.22 * np.exp(-((up - 1.6) ** 2) / 2.5 - (along - 0.4) ** 2 / 6.0)
     return np.asarray(np.clip(image * light[..., None], 0, 255).astype(np.uint8))
 
 
