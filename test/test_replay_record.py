@@ -140,14 +140,18 @@ def test_recording_a_replay_gives_the_same_bytes(make, context, tmp_path):
     written = write_bag(tmp_path / "first", count=10)
     record = make(RecordNode, bag=str(tmp_path / "second"))
     replay = make(ReplayNode, bag=str(tmp_path / "first"), rate=2.0, settle_s=0.3)
-    assert spin([record, replay], context, until=replay.done.is_set, timeout_s=20)
-    spin([record], context, timeout_s=0.5)
+
+    def finished():
+        return replay.done.is_set() and sum(record.writer.counts.values()) >= len(written)
+
+    assert spin([record, replay], context, until=finished, timeout_s=20)
     record.finish()
     assert (replay.published, replay.invalid, replay.error) == (len(written), 0, None)
     with BagReader(tmp_path / "second") as bag:
         assert bag.damage == ""
         assert set(bag.topics) == {"/cam0/image_raw", "/cam1/image_raw"}  # no results, no /clock
         got = sorted((m.topic, m.cdr) for m in bag.messages())
+    assert len(got) == len(written)
     assert got == sorted((name, cdr) for name, _, cdr in written)
     assert "recorded 20 messages" in record.summary()
     assert "10 " in record.summary()
