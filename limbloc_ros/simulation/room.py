@@ -175,7 +175,7 @@ class SimulatedRoom:
             x, y, z = camera.T_world_camera[:3, 3]
             if max(abs(x), abs(y)) >= HALF_M or not 0 < z < HEIGHT_M:
                 raise RigError(
-                    f"camera {camera.name} stands at ({x:.2f}, {y:.2f}, {z:.2f}) m; expected inside the simulated room: "
+                    f"camera {camera.name} stands at ({x:.2f}, {y:.2f}, {z:.2f}) m; expected inside the room: "
                     f"|x|, |y| below {HALF_M} m and z between 0 and {HEIGHT_M} m"
                 )
         self.rig = rig
