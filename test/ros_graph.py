@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 from collections.abc import Callable
 from typing import Any
@@ -13,7 +14,7 @@ from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from limbloc_ros.ros import node_main, topics
+from limbloc_ros.ros import health, node_main, topics
 
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 
@@ -22,11 +23,14 @@ DOMAIN = 1 + os.getpid() % 100
 
 TIMEOUT_S = 20.0
 
+health.PERIOD_S = 0.1  # diagnostics ten times a second, or the tests would mostly wait for them
+
 
 class Graph:
     """Nodes under test and one tester node, spun together in this thread."""
 
     def __init__(self) -> None:
+        gc.collect()  # nodes whose constructor failed in an earlier test are still on the network until then
         self.context = Context()
         rclpy.init(context=self.context, domain_id=DOMAIN)
         self.nodes: list[Node] = []

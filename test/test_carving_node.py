@@ -1,0 +1,307 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The carving node over real DDS: sets, dead cameras, wrong masks, empty rooms, and a rig from CameraInfo and TF."""
+
+from __future__ import annotations
+
+import sys
+import types
+from array import array
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticStatus
+from rclpy.parameter import Parameter
+from ros_graph import Graph
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
+
+from limbloc_ros.core.camera import Rig
+from limbloc_ros.core.errors import ConfigError, InputError, NoPerson, RigError
+from limbloc_ros.core.hull import Hull
+from limbloc_ros.core.pipeline import Carver
+from limbloc_ros.nodes.carving import CarvingNode
+from limbloc_ros.rig.rig_file import save_rig
+from limbloc_ros.ros import topics
+from limbloc_ros.ros.cloud_messages import cloud_to_hull
+from limbloc_ros.ros.image_messages import camera_to_info, mask_to_compressed, mask_to_image
+from limbloc_ros.ros.messages import make_header, stamp_ns, transform_to_message
+from limbloc_ros.simulation.room import SimulatedRoom, default_rig
+
+CAMERAS = 4
+T0_NS = 1_000_000_000_000
+FRAME_NS = 100_000_000
+
+Masks = dict[str, np.ndarray]
+
+
+@pytest.fixture
+def graph() -> Iterator[Graph]:
+    graph = Graph()
+    yield graph
+    graph.close()
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    return default_rig(CAMERAS, 160, 120)
+
+
+@pytest.fixture(scope="module")
+def person(rig: Rig) -> Masks:
+    room = SimulatedRoom(rig, empty_s=0.0)
+    return {name: room.render_with_mask(name, 1.0)[1] for name in rig.names}
+
+
+@pytest.fixture
+def rig_file(rig: Rig, tmp_path: Path) -> str:
+    save_rig(rig, tmp_path / "rig.yaml")
+    return str(tmp_path / "rig.yaml")
+
+
+class Cameras:
+    """Publishes compressed masks of all cameras and waits for hulls."""
+
+    def __init__(self, graph: Graph, names: tuple[str, ...]) -> None:
+        self.graph = graph
+        self.hulls: list[PointCloud2] = graph.collect(PointCloud2, "hull")
+        self.diagnostics = graph.diagnostics()
+        self.publishers = {name: graph.publisher(CompressedImage, f"{name}/mask/compressed") for name in names}
+        graph.until(lambda: graph.tester.count_publishers("hull") > 0)
+        graph.spin(0.1)
+
+    def send(self, masks: Masks, n: int, skew_ns: int = 0) -> None:
+        """One frame; camera k's stamp is k * skew_ns late."""
+        for k, (name, mask) in enumerate(masks.items()):
+            header = make_header(T0_NS + n * FRAME_NS + k * skew_ns, topics.optical_frame(name))
+            self.publishers[name].publish(mask_to_compressed(mask, header))
+
+    def hull(self, masks: Masks, n: int, **options: Any) -> Hull | None:
+        """Send one frame and return what was carved."""
+        before = len(self.hulls)
+        self.send(masks, n, **options)
+        self.graph.until(lambda: len(self.hulls) == before + 1)
+        assert stamp_ns(self.hulls[-1].header) == T0_NS + n * FRAME_NS
+        return cloud_to_hull(self.hulls[-1])
+
+
+def empty(masks: Masks) -> Masks:
+    return {name: np.zeros_like(mask) for name, mask in masks.items()}
+
+
+def assert_same_hull(hull: Hull | None, expected: Hull | NoPerson) -> None:
+    assert isinstance(hull, Hull)
+    assert isinstance(expected, Hull)
+    assert (hull.voxel_m, hull.band_m, hull.index_min) == (expected.voxel_m, expected.band_m, expected.index_min)
+    assert hull.sdf.tobytes() == expected.sdf.tobytes()
+
+
+def test_the_live_hull_is_the_offline_hull_bit_for_bit(graph: Graph, rig: Rig, rig_file: str, person: Masks) -> None:
+    graph.add(CarvingNode, rig_file=rig_file)
+    cameras = Cameras(graph, rig.names)
+    assert_same_hull(cameras.hull(person, 0, skew_ns=1_000_000), Carver(rig).carve(person))
+    assert cameras.hulls[-1].header.frame_id == "room"
+    graph.until(lambda: cameras.diagnostics["carving: hull"] is not None)
+    assert cameras.diagnostics.value("carving: hull", "sets_complete") == "1"
+    assert float(cameras.diagnostics.value("carving: hull", "skew_ms")) == pytest.approx(3.0)
+    assert int(cameras.diagnostics.value("carving: hull", "voxels_inside")) > 1000
+
+
+def test_raw_masks_give_the_same_hull(graph: Graph, rig: Rig, rig_file: str, person: Masks) -> None:
+    graph.add(CarvingNode, rig_file=rig_file, mask_transport="raw")
+    hulls = graph.collect(PointCloud2, "hull")
+    publishers = {name: graph.publisher(Image, f"{name}/mask") for name in rig.names}
+    graph.until(lambda: graph.tester.count_publishers("hull") > 0)
+    graph.spin(0.1)
+    for name, mask in person.items():
+        publishers[name].publish(mask_to_image(mask, make_header(T0_NS, "")))
+    graph.until(lambda: len(hulls) == 1)
+    assert_same_hull(cloud_to_hull(hulls[0]), Carver(rig).carve(person))
+
+
+def test_an_empty_room_gives_empty_hulls_and_says_so(graph: Graph, rig: Rig, rig_file: str, person: Masks) -> None:
+    graph.add(CarvingNode, rig_file=rig_file)
+    cameras = Cameras(graph, rig.names)
+    assert cameras.hull(empty(person), 0) is None
+    graph.until(cameras.diagnostics.says("carving: hull", "no person"))
+    assert cameras.diagnostics["carving: hull"].level == DiagnosticStatus.OK
+    assert cameras.hull(person, 1) is not None
+
+
+def test_a_dead_camera_is_named_and_the_others_go_on(graph: Graph, rig: Rig, rig_file: str, person: Masks) -> None:
+    graph.add(CarvingNode, rig_file=rig_file)
+    cameras = Cameras(graph, rig.names[:3])
+    three = {name: person[name] for name in rig.names[:3]}
+    expected = Carver(rig).carve(three)
+    for n in range(7):
+        assert_same_hull(cameras.hull(three, n), expected)
+    graph.until(cameras.diagnostics.says("carving: camera cam3", "no mask on cam3/mask/compressed", "nobody publishes"))
+    status = cameras.diagnostics["carving: camera cam3"]
+    assert status.level == DiagnosticStatus.ERROR
+    assert all(f"/cam{k}/mask/compressed" in status.message for k in range(3))  # what there is instead
+    assert cameras.diagnostics.value("carving: camera cam3", "missing") == "7"
+
+
+def test_fewer_masks_than_min_cameras_give_no_hull(graph: Graph, rig: Rig, rig_file: str, person: Masks) -> None:
+    graph.add(CarvingNode, rig_file=rig_file, hull__min_cameras=4)
+    cameras = Cameras(graph, rig.names)
+    cameras.send({name: person[name] for name in rig.names[:3]}, 0)
+    graph.until(lambda: cameras.diagnostics["carving: hull"] is not None)
+    graph.until(lambda: cameras.diagnostics.value("carving: hull", "sets_dropped") == "1")
+    assert not cameras.hulls
+
+
+def test_masks_of_different_instants_are_never_mixed(graph: Graph, rig: Rig, rig_file: str, person: Masks) -> None:
+    """The last camera is 40 ms late, twice the slop: its masks make sets of their own, which are too small."""
+    graph.add(CarvingNode, rig_file=rig_file)
+    cameras = Cameras(graph, rig.names)
+    three = {name: person[name] for name in rig.names[:3]}
+    cameras.send(three, 0)
+    late = make_header(T0_NS + 40_000_000, "")
+    cameras.publishers["cam3"].publish(mask_to_compressed(person["cam3"], late))
+    graph.until(lambda: len(cameras.hulls) == 1)
+    assert_same_hull(cloud_to_hull(cameras.hulls[0]), Carver(rig).carve(three))
+    graph.until(lambda: cameras.diagnostics["carving: hull"] is not None)
+    graph.until(lambda: cameras.diagnostics.value("carving: hull", "sets_dropped") == "1")
+    assert len(cameras.hulls) == 1
+
+
+def test_a_mask_of_the_wrong_size_is_named_and_left_out(graph: Graph, rig: Rig, rig_file: str, person: Masks) -> None:
+    graph.add(CarvingNode, rig_file=rig_file)
+    cameras = Cameras(graph, rig.names)
+    wrong = {**person, "cam2": np.full((240, 320), 255, np.uint8)}
+    rest = {name: mask for name, mask in person.items() if name != "cam2"}
+    assert_same_hull(cameras.hull(wrong, 0), Carver(rig).carve(rest))
+    graph.until(cameras.diagnostics.says("carving: hull", "camera cam2", "160x120", "320x240"))
+    assert cameras.diagnostics["carving: hull"].level == DiagnosticStatus.ERROR
+
+
+def test_a_truncated_mask_is_named_and_the_node_goes_on(graph: Graph, rig: Rig, rig_file: str, person: Masks) -> None:
+    graph.add(CarvingNode, rig_file=rig_file)
+    cameras = Cameras(graph, rig.names)
+    msg = mask_to_compressed(person["cam1"], make_header(T0_NS, ""))
+    msg.data = array("B", msg.data[:100])
+    cameras.publishers["cam1"].publish(msg)
+    graph.until(cameras.diagnostics.says("carving: hull", "camera cam1", "PNG", "truncated"))
+    assert cameras.hull(person, 1) is not None
+
+
+def test_a_looped_bag_goes_on_after_the_jump_back(graph: Graph, rig: Rig, rig_file: str, person: Masks) -> None:
+    graph.add(CarvingNode, rig_file=rig_file)
+    cameras = Cameras(graph, rig.names)
+    for n in (50, 51, 0, 1):
+        assert cameras.hull(person, n) is not None
+    graph.until(lambda: cameras.diagnostics["carving: hull"] is not None)
+    graph.until(lambda: cameras.diagnostics.value("carving: hull", "jumps_back_in_time") == "1")
+
+
+def test_some_cameras_of_the_rig(graph: Graph, rig: Rig, rig_file: str, person: Masks) -> None:
+    node = graph.add(CarvingNode, rig_file=rig_file, cameras=["cam0", "cam2", "cam3"])
+    assert node.rig.names == ("cam0", "cam2", "cam3")
+    cameras = Cameras(graph, node.rig.names)
+    three = {name: person[name] for name in node.rig.names}
+    assert_same_hull(cameras.hull(three, 0), Carver(rig).carve(three))
+
+
+def test_live_parameters(graph: Graph, rig_file: str) -> None:
+    node = graph.add(CarvingNode, rig_file=rig_file)
+    results = node.set_parameters(
+        [
+            Parameter("sync.slop_s", value=0.05),
+            Parameter("hull.min_cameras", value=3),
+            Parameter("hull.voxel_m", value=0.03),
+        ]
+    )
+    assert [r.successful for r in results] == [True, True, False]
+    assert (node.synchroniser.slop_s, node.synchroniser.min_cameras, node.hull_config.voxel_m) == (0.05, 3, 0.02)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "error", "words"),
+    [
+        ({"rig_file": "nowhere.yaml"}, RigError, "nowhere.yaml"),
+        ({"cameras": ["cam0", "cam9"]}, RigError, "no camera 'cam9'; it has cam0, cam1"),
+        ({"hull__voxel_m": 0.02000001}, InputError, "micrometres"),
+    ],
+)
+def test_what_cannot_work_stops_the_node_at_its_start(
+    graph: Graph, rig_file: str, parameters: dict[str, object], error: type[Exception], words: str
+) -> None:
+    with pytest.raises(error, match=words):
+        graph.add(CarvingNode, **{"rig_file": rig_file, **parameters})
+
+
+# --- CameraInfo and TF ---
+
+
+def fake_tf2(transforms: dict[tuple[str, str], Any]) -> Any:
+    """The few names of tf2_ros that we use; it has no wheel, so a stand-in is all that runs everywhere."""
+    module = types.ModuleType("tf2_ros")
+
+    class TransformException(Exception):
+        pass
+
+    class Buffer:
+        def lookup_transform(self, parent: str, child: str, _: object) -> Any:
+            if (parent, child) not in transforms:
+                raise TransformException(f"{parent} {child}")
+            return transforms[parent, child]
+
+    module.TransformException = TransformException
+    module.Buffer = Buffer
+    module.TransformListener = lambda buffer, node: (buffer, node)
+    return module
+
+
+@pytest.fixture
+def tf(monkeypatch: pytest.MonkeyPatch) -> dict[tuple[str, str], Any]:
+    transforms: dict[tuple[str, str], Any] = {}
+    monkeypatch.setitem(sys.modules, "tf2_ros", fake_tf2(transforms))
+    return transforms
+
+
+def test_a_rig_from_camera_info_and_tf(graph: Graph, rig: Rig, person: Masks, tf: dict[tuple[str, str], Any]) -> None:
+    node = graph.add(CarvingNode, cameras=list(rig.names), volume_min=[-1.5, -1.5, 0.0], volume_max=[1.5, 1.5, 2.4])
+    diagnostics = graph.diagnostics()
+    graph.until(diagnostics.says("carving: hull", "no rig yet", "no CameraInfo on cam3/camera_info"))
+    for camera in rig.cameras:
+        frame = topics.optical_frame(camera.name)
+        info = graph.publisher(CameraInfo, topics.camera_info(camera.name))
+        info.publish(camera_to_info(camera, make_header(T0_NS, frame)))
+    graph.until(diagnostics.says("carving: hull", "TF has no transform from room to 'cam0_optical'"))
+    for camera in rig.cameras:
+        frame = topics.optical_frame(camera.name)
+        tf["room", frame] = transform_to_message(camera.T_world_camera, frame, make_header(0, "room"))
+    graph.until(lambda: node.rig is not None)
+    cameras = Cameras(graph, rig.names)
+    hull = cameras.hull(person, 0)
+    expected = Carver(rig).carve(person)
+    assert hull is not None
+    assert isinstance(expected, Hull)
+    # A quaternion does not carry a rotation to the last bit.
+    assert hull.inside_count == pytest.approx(expected.inside_count, rel=1e-3)
+
+
+def test_an_all_zero_k_is_explained(graph: Graph, rig: Rig, tf: dict[tuple[str, str], Any]) -> None:
+    graph.add(CarvingNode, cameras=["cam0", "cam1"])
+    diagnostics = graph.diagnostics()
+    for camera in rig.cameras[:2]:
+        frame = topics.optical_frame(camera.name)
+        tf["room", frame] = transform_to_message(camera.T_world_camera, frame, make_header(0, "room"))
+        msg = camera_to_info(camera, make_header(T0_NS, frame))
+        if camera.name == "cam1":
+            msg.k = np.zeros(9)
+        graph.publisher(CameraInfo, topics.camera_info(camera.name)).publish(msg)
+    graph.until(diagnostics.says("carving: camera cam1", "all-zero K", "camera_calibration"))
+
+
+def test_without_tf2_the_error_says_what_to_do(graph: Graph, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "tf2_ros", None)
+    with pytest.raises(RigError, match="tf2-ros-py, or give the parameter rig_file"):
+        graph.add(CarvingNode, cameras=["cam0", "cam1"])
+
+
+def test_neither_rig_file_nor_cameras(graph: Graph) -> None:
+    with pytest.raises(ConfigError, match="parameter cameras"):
+        graph.add(CarvingNode)
