@@ -29,6 +29,10 @@ class OutputError(LimblocError):
     """A result or recording cannot be written: the disk is full, no permission, it exists already."""
 
 
+class Interrupted(LimblocError):
+    """Ctrl-C in the middle of long work; the message says what is kept and how to go on."""
+
+
 @dataclass(frozen=True)
 class NoPerson:
     """A frame in which no posture can be given, with the reason in words (never zeros or a silent default)."""

@@ -118,7 +118,7 @@ def load_case(folder: str | Path, rig: Rig | None = None) -> Case:
 def read_npz(path: Path) -> dict[str, NDArray[Any]]:
     """All arrays of an .npz archive; raises InputError when it is missing or damaged."""
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files}
     except (OSError, ValueError, zipfile.BadZipFile, EOFError, KeyError) as error:
         raise InputError(f"{path} cannot be read as an .npz archive ({error}); copy it again") from None

@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from limbloc_ros.core.errors import InputError
+from limbloc_ros.core.errors import InputError, OutputError
 from limbloc_ros.recordings.results import FrameResult, load_frames, save_frames
 
 #: Results are written down after this many frames or seconds, whichever comes first.
@@ -64,12 +64,12 @@ class Checkpoint:
             self.flush()
 
     def flush(self) -> None:
-        """Write down what is not on disk yet; raises InputError when that fails."""
+        """Write down what is not on disk yet; raises OutputError when that fails."""
         if self._waiting and self._folder is not None:
             try:
                 self._folder.mkdir(parents=True, exist_ok=True)
             except OSError as error:
-                raise InputError(f"{self._folder} cannot be made: {error.strerror}; choose another --out") from None
+                raise OutputError(f"{self._folder} cannot be made: {error.strerror}; choose another --out") from None
             save_frames(self._waiting, _chunk(self._folder, self._count))
             self._count += len(self._waiting)
             self._waiting = []

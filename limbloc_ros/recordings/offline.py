@@ -13,6 +13,7 @@ import multiprocessing
 import os
 import shutil
 import signal
+import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -26,18 +27,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from limbloc_ros import __version__
+from limbloc_ros.core import background
 from limbloc_ros.core.camera import Rig
 from limbloc_ros.core.config import BackgroundConfig, FitConfig, HullConfig, SyncConfig
-from limbloc_ros.core.errors import InputError, LimblocError, NoPerson
+from limbloc_ros.core.errors import InputError, Interrupted, NoPerson
 from limbloc_ros.core.pipeline import Carver, PoseEstimator
 from limbloc_ros.recordings.cases import pack_mask, unpack_mask
 from limbloc_ros.recordings.checkpoint import Checkpoint, fingerprint
+from limbloc_ros.recordings.kept_frames import KeptFrames
 from limbloc_ros.recordings.results import FrameResult, Run
-from limbloc_ros.recordings.sources import MaskSet, Source
-
-
-class Interrupted(LimblocError):
-    """Ctrl-C: what was finished is kept, the message says how to go on."""
+from limbloc_ros.recordings.sources import Source
 
 
 @dataclass(frozen=True)
@@ -60,6 +59,7 @@ def process(
     *,
     partial: Path | None = None,
     jobs: int = 0,
+    kept: KeptFrames | None = None,
     progress: Progress = lambda done, total: None,
     say: Callable[[str], None] = lambda text: None,
 ) -> Run:
@@ -71,6 +71,7 @@ def process(
         partial: folder in which finished frames are kept; the caller calls `forget_partial` once it has saved the
             run. None: nothing is kept.
         jobs: processes; 0 takes one per usable core.
+        kept: takes a few frames with masks and images for the report.
         progress: told after each frame.
         say: told in words what a person would want to know.
 
@@ -88,13 +89,14 @@ def process(
     done = checkpoint.done
     if done:
         say(f"going on after frame {len(done)}, where the last run was interrupted")
-    if config.fit.temporal and jobs > 1:
-        say("temporal: each frame starts from the one before, so one process does them all")
+    if config.fit.temporal and jobs != 1:
+        say("temporal: each frame starts from the one before, so one process does them all, in order")
     jobs = 1 if config.fit.temporal else min(jobs or usable_cores(), source.frames or 10**6)
     frames = list(done)
+    kept = kept if kept is not None else KeptFrames()
     progress(len(frames), source.frames)
     try:
-        for frame in _fitted(source, config, jobs, skip=len(done)):
+        for frame in _fitted(source, config, jobs, len(done), kept):
             frames.append(frame)
             checkpoint.add(frame)
             progress(len(frames), source.frames)
@@ -113,6 +115,19 @@ def process(
         raise InputError(f"{source.about['input']}: no frame could be made of it; " + "; ".join(source.notes))
     about = {**source.about, "config": dataclasses.asdict(config), "version": __version__}
     return Run(tuple(frames), about)
+
+
+def prepare(say: Callable[[str], None] = lambda text: None) -> None:
+    """Compile or load the kernels, once for all worker processes; when that takes long, `say` tells so."""
+    cv2.setNumThreads(1)
+    patience = threading.Timer(2.0, say, ["compiling the numeric kernels; only the first run does, half a minute"])
+    patience.daemon = True
+    patience.start()
+    try:
+        background.warm_up()
+        PoseEstimator.warm_up()
+    finally:
+        patience.cancel()
 
 
 def forget_partial(partial: Path) -> None:
@@ -171,9 +186,9 @@ class _Fitter:
         return FrameResult(job.stamp_ns, outcome, stage_ms)
 
 
-def _fitted(source: Source, config: OfflineConfig, jobs: int, skip: int) -> Iterator[FrameResult]:
+def _fitted(source: Source, config: OfflineConfig, jobs: int, skip: int, kept: KeptFrames) -> Iterator[FrameResult]:
     """Results in the order of the frames, from number `skip` on."""
-    work = (_job(masks) for i, masks in enumerate(source.mask_sets()) if i >= skip)
+    work = _jobs(source, kept, skip)
     if jobs == 1:
         cv2.setNumThreads(1)
         fitter = _Fitter(source.rig, config)
@@ -195,9 +210,13 @@ def _fitted(source: Source, config: OfflineConfig, jobs: int, skip: int) -> Iter
             pool.shutdown(wait=True, cancel_futures=True)
 
 
-def _job(masks: MaskSet) -> _Job:
-    packed = {name: pack_mask(mask) for name, mask in masks.masks.items()}
-    return _Job(masks.stamp_ns, packed, masks.reason, masks.stage_ms)
+def _jobs(source: Source, kept: KeptFrames, skip: int) -> Iterator[_Job]:
+    """Frames from number `skip` on; those before are only looked at, because segmentation needs them."""
+    for number, frame in enumerate(source.mask_sets()):
+        kept.add(number, frame.masks, frame.images)
+        if number >= skip:
+            packed = {name: pack_mask(mask) for name, mask in frame.masks.items()}
+            yield _Job(frame.stamp_ns, packed, frame.reason, frame.stage_ms)
 
 
 _worker: _Fitter | None = None

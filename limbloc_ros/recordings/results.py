@@ -27,7 +27,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from limbloc_ros.core.errors import InputError, NoPerson
+from limbloc_ros.core.errors import InputError, NoPerson, OutputError
 from limbloc_ros.core.pose import JOINT_NAMES, Flesh, Pose
 from limbloc_ros.recordings.cases import read_npz
 
@@ -41,12 +41,17 @@ class FrameResult:
     Attributes:
         stamp_ns: its acquisition stamp, ns.
         outcome: the pose, or why there is none.
-        stage_ms: process time of each stage, ms; also of the stages before the pose.
+        stage_ms: process time of the stages before the pose, ms.
     """
 
     stamp_ns: int
     outcome: Pose | NoPerson
     stage_ms: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def times(self) -> dict[str, float]:
+        """Process time of all stages, those of the pose included, ms."""
+        return {**self.stage_ms, **(self.outcome.stage_ms if isinstance(self.outcome, Pose) else {})}
 
 
 @dataclass(frozen=True)
@@ -116,12 +121,12 @@ class Run:
         """Write all four files into `folder`, which is made if need be.
 
         Raises:
-            InputError: the folder cannot be written to (a full disk, no permission).
+            OutputError: the folder cannot be written to (a full disk, no permission).
         """
         folder = Path(folder)
         _make_folder(folder)
         self.save_joints(folder / "joints.npz")
-        _replace(folder / "joint_angles.csv", lambda file: file.write(self._angles_csv().encode()))
+        replace_file(folder / "joint_angles.csv", lambda file: file.write(self._angles_csv().encode()))
         save_frames(self.frames, folder / "run.npz")
         found = [f.outcome for f in self.frames if isinstance(f.outcome, Pose)]
         summary = {
@@ -131,7 +136,7 @@ class Run:
             "reliable": int(self.reliable.sum()),
             "median_energy": float(np.median([pose.energy for pose in found])) if found else None,
         }
-        _replace(folder / "run.json", lambda file: file.write((json.dumps(summary, indent=2) + "\n").encode()))
+        replace_file(folder / "run.json", lambda file: file.write((json.dumps(summary, indent=2) + "\n").encode()))
 
     def save_joints(self, path: str | Path) -> None:
         """Write just the prediction file, `joints.npz` of the module's table."""
@@ -144,7 +149,7 @@ class Run:
             "reliable": self.reliable,
         }
         _make_folder(Path(path).parent)
-        _replace(Path(path), lambda file: np.savez_compressed(file, **arrays))
+        replace_file(Path(path), lambda file: np.savez_compressed(file, **arrays))
 
     def _angles_csv(self) -> str:
         text = io.StringIO()
@@ -207,7 +212,7 @@ def save_frames(frames: Sequence[FrameResult], path: Path) -> None:
         }
         names = arrays["pose_stage_names"]
         arrays["pose_stage_ms"] = np.array([[p.stage_ms.get(str(s), np.nan) for s in names] for p in poses])
-    _replace(path, lambda file: np.savez_compressed(file, **arrays))
+    replace_file(path, lambda file: np.savez_compressed(file, **arrays))
 
 
 def load_frames(path: Path) -> tuple[FrameResult, ...]:
@@ -268,11 +273,15 @@ def _make_folder(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"output folder {folder} cannot be made: {error.strerror}") from None
+        raise OutputError(f"output folder {folder} cannot be made: {error.strerror}") from None
 
 
-def _replace(path: Path, write: Callable[[IO[bytes]], Any]) -> None:
-    """Write a file under a temporary name and rename it: no reader ever sees half of it."""
+def replace_file(path: Path, write: Callable[[IO[bytes]], Any]) -> None:
+    """Write a file under a temporary name and rename it: no reader ever sees half of it.
+
+    Raises:
+        OutputError: the disk is full or the folder not writable; what was there before is still there.
+    """
     temporary = path.with_name(f".{path.name}.writing")
     try:
         with temporary.open("wb") as file:
@@ -283,7 +292,7 @@ def _replace(path: Path, write: Callable[[IO[bytes]], Any]) -> None:
     except OSError as error:
         with contextlib.suppress(OSError):  # the disk may be gone altogether; the first error is the one to tell
             temporary.unlink(missing_ok=True)
-        raise InputError(
+        raise OutputError(
             f"{path} cannot be written: {error.strerror or error}; make room or choose another --out, "
             "then run the same command again: finished frames are kept"
         ) from None

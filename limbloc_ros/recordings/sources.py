@@ -37,12 +37,14 @@ class MaskSet:
         masks: camera name -> uint8 [height, width] of the rig's size, non-zero = foreground.
         reason: why there is nothing to carve, empty when there is.
         stage_ms: process time of the stages so far, ms.
+        images: camera name -> the image (grey or bgr) that the mask was made from, where there is one.
     """
 
     stamp_ns: int
     masks: dict[str, Pixels]
     reason: str = ""
     stage_ms: dict[str, float] = field(default_factory=dict)
+    images: dict[str, Pixels] = field(default_factory=dict)
 
 
 class Source(Protocol):
@@ -138,7 +140,7 @@ class BagSource:
                 reason = ""
                 if images:
                     masks, reason = segmenter.masks(images)
-                yield MaskSet(frames.stamp_ns, masks, reason, {"mask": 1e3 * (time.process_time() - start)})
+                yield MaskSet(frames.stamp_ns, masks, reason, {"mask": 1e3 * (time.process_time() - start)}, images)
             if bag.damage:
                 self.notes.append(f"{self._path}: {bag.damage}")
         self.notes += [f"camera {name}: {count} damaged pictures were left out" for name, count in damaged.items()]

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The subcommands of `limbloc`, one module each: `HELP`, `EPILOG`, `add_arguments`, `run`."""
