@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 
 import cv2
@@ -37,7 +38,9 @@ def draw_stick(image: Image, camera: Camera, joints: Array) -> Image:
     """
     _check_size(image, camera)
     picture = image.copy()
-    width = max(2, round(camera.height / 160))
+    on_image = _projected(camera, joints)
+    person_px = float(np.ptp(on_image, axis=0).max()) if len(on_image) else 0.0
+    width = max(1, round(person_px / 95))
     strokes = []
     for a, b in STICK_BONES:
         t = np.linspace(0, 1, PIECES + 1)[:, None]
@@ -97,17 +100,12 @@ def overlay_montage(
     panels = []
     for camera in cameras:
         picture = as_bgr(images[camera.name])
+        _check_size(picture, camera)
+        centre, size = _around_person(camera, joints) if close_up else _whole(camera)
+        picture, window = _cut(picture, camera, centre, size, panel_width_px)
         if flesh is not None:
-            picture = draw_flesh(picture, camera, flesh)
-        picture = draw_stick(picture, camera, joints)
-        if close_up:
-            picture = _around_person(picture, camera, joints)
-        height = round(panel_width_px * picture.shape[0] / picture.shape[1])
-        shrinks = picture.shape[1] > panel_width_px
-        picture = cv2.resize(
-            picture, (panel_width_px, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC
-        )
-        panels.append(label(picture, camera.name))
+            picture = draw_flesh(picture, window, flesh)
+        panels.append(label(draw_stick(picture, window, joints), camera.name))
     columns = columns or min(len(panels), 4 if len(panels) > 4 else 2)
     tallest, gap = max(p.shape[0] for p in panels), 6
     rows = -(-len(panels) // columns)
@@ -118,24 +116,43 @@ def overlay_montage(
     return sheet
 
 
-def _around_person(picture: Image, camera: Camera, joints: Array) -> Image:
-    """The part of the picture that shows the joints, 3 wide and 4 high; dark where it reaches over the edge."""
-    uv, _ = camera.world_to_image(joints)
-    uv = uv[np.isfinite(uv).all(axis=1)]
-    inside = uv[((uv > -camera.width) & (uv < 2 * camera.width)).all(axis=1)]
-    if not len(inside):
-        return picture
-    low, high = inside.min(axis=0), inside.max(axis=0)
+def _around_person(camera: Camera, joints: Array) -> tuple[Array, Array]:
+    """Centre and size, px, of the part of the image that shows the joints, 3 wide and 4 high."""
+    uv = _projected(camera, joints)
+    if not len(uv):
+        return _whole(camera)
+    low, high = uv.min(axis=0), uv.max(axis=0)
     height = max(1.25 * (high[1] - low[1]), 1.35 * (high[0] - low[0]) * 4 / 3, 48.0)
-    size = (round(height * 3 / 4), round(height))
-    centre = (low + high) / 2
-    patch = np.full((size[1], size[0], 3), 38, dtype=np.uint8)
-    x0, y0 = (round(float(c) - n / 2) for c, n in zip(centre, size, strict=True))
-    left, top = max(x0, 0), max(y0, 0)
-    right, bottom = min(x0 + size[0], camera.width), min(y0 + size[1], camera.height)
-    if right > left and bottom > top:
-        patch[top - y0 : bottom - y0, left - x0 : right - x0] = picture[top:bottom, left:right]
-    return patch
+    return (low + high) / 2, np.array([height * 3 / 4, height])
+
+
+def _whole(camera: Camera) -> tuple[Array, Array]:
+    """Centre and size, px, of the whole image."""
+    size = np.array([camera.width, camera.height], dtype=np.float64)
+    return (size - 1) / 2, size
+
+
+def _cut(image: Image, camera: Camera, centre: Array, size: Array, width_px: int) -> tuple[Image, Camera]:
+    """A part of the image, `width_px` wide and dark beyond the image's edge, and the camera that would have taken it.
+
+    Cutting and scaling change the intrinsics alone: pixel u becomes scale * (u - centre) + the new middle.
+    """
+    scale = width_px / size[0]
+    new = (width_px, round(float(size[1] * scale)))
+    shift = (np.array(new) - 1) / 2 - scale * centre
+    M = np.array([[scale, 0, shift[0]], [0, scale, shift[1]], [0, 0, 1]])
+    if scale < 0.7:  # against flicker of fine texture
+        image = cv2.GaussianBlur(image, (0, 0), 0.4 / scale)
+    cut = cv2.warpAffine(image, M[:2], new, flags=cv2.INTER_LINEAR, borderValue=(38, 38, 38))
+    return cut, dataclasses.replace(camera, width=new[0], height=new[1], K=M @ camera.K)
+
+
+def _projected(camera: Camera, joints: Array) -> Array:
+    """[N, 2] px of the joints that fall near the image."""
+    uv, _ = camera.world_to_image(joints)
+    size = np.array([camera.width, camera.height])
+    near = np.isfinite(uv).all(axis=1) & (np.abs(np.nan_to_num(uv) - size / 2) < 1.5 * size).all(axis=1)
+    return np.asarray(uv[near])
 
 
 def as_bgr(image: Image) -> Image:

@@ -45,7 +45,9 @@ td { overflow-wrap: anywhere; }
 td.number, th.number { text-align: right; white-space: nowrap; }
 code { font: 0.9em/1.5 ui-monospace, SFMono-Regular, Menlo, Consolas, monospace; overflow-wrap: anywhere; }
 @media (max-width: 560px) { section { padding: 14px; border-radius: 10px; } h1 { font-size: 1.5rem; }
-  tbody th { white-space: normal; } }
+  nav { flex-wrap: nowrap; overflow-x: auto; padding-bottom: 4px; } nav a { white-space: nowrap; }
+  .facts tr { display: block; border-bottom: 1px solid var(--line); padding: 6px 0; }
+  .facts tr:last-child { border-bottom: 0; } .facts th, .facts td { display: block; border: 0; padding: 0; } }
 @media print { nav { display: none; } section { break-inside: avoid; } }
 """
 
@@ -137,7 +139,8 @@ def _table(table: Table) -> str:
         numbers = [_number(i + 1) if table.head else "" for i in range(len(texts))]
         cells = "".join(f"<td{number}>{text}</td>" for number, text in zip(numbers, texts, strict=True))
         rows.append(f'<tr><th scope="row">{escape(name)}</th>{cells}</tr>')
-    return f'<div class="scroll"><table>{head}<tbody>{"".join(rows)}</tbody></table></div>'
+    kind = "" if table.head else ' class="facts"'
+    return f'<div class="scroll"><table{kind}>{head}<tbody>{"".join(rows)}</tbody></table></div>'
 
 
 def _number(column: int) -> str:

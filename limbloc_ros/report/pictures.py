@@ -72,9 +72,10 @@ def panels(
     samples: Sequence[Sample],
     layers_of: Callable[[Sample, Mesh], list[Layer]],
     turns_rad: Sequence[float] = (0.45,),
-    size_px: tuple[int, int] = PANEL_PX,
+    size_px: tuple[int, int] | None = None,
 ) -> list[Picture]:
     """One picture per turn and sample (all samples of the first turn first), all to the same scale."""
+    size_px = size_px or PANEL_PX
     hulls = [hull_mesh(sample.hull) for sample in samples]
     distance = max(fitting_distance(s, m, t, size_px) for s, m in zip(samples, hulls, strict=True) for t in turns_rad)
     layers = [layers_of(sample, mesh) for sample, mesh in zip(samples, hulls, strict=True)]
@@ -208,9 +209,8 @@ def sheet(
         axes = figure.add_axes(box)
         axes.imshow(picture, interpolation="none", aspect="auto")
         axes.axis("off")
-        axes.text(
-            0.04, 0.97, title, transform=axes.transAxes, va="top", fontsize=11.5, color="#303640", linespacing=1.35
-        )
+        middle = (x + width / 2) / full_width, 1 - (y + height + strip / 2) / full_height
+        figure.text(*middle, title, ha="center", va="center", fontsize=12, color="#303640")
     if colour_bar:
         colour_map, low, high, text = colour_bar
         bar_width = min(0.8, 640 / full_width)

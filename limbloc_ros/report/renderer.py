@@ -208,9 +208,14 @@ def _occlusion(z_buffer: FloatPicture, seen: NDArray[np.bool_], focal_px: float,
     """
     near = float(z_buffer[seen].min())
     filled = np.where(seen, z_buffer, np.float32(0))
-    sigma = 0.05 * focal_px / near
-    weight = cv2.GaussianBlur(seen.astype(np.float32), (0, 0), sigma)
-    around = cv2.GaussianBlur(filled, (0, 0), sigma) / np.maximum(weight, 1e-6)
+    # A wide blur costs its width: it is done on a coarser picture, where it is a few pixels wide.
+    coarse = max(1, round(0.05 * focal_px / near / 4))
+    height, width = z_buffer.shape
+    small = (-(-width // coarse), -(-height // coarse))
+    blurred = cv2.resize(np.dstack([seen.astype(np.float32), filled]), small, interpolation=cv2.INTER_AREA)
+    blurred = cv2.GaussianBlur(blurred, (0, 0), 0.05 * focal_px / near / coarse)
+    blurred = cv2.resize(blurred, (width, height), interpolation=cv2.INTER_LINEAR)
+    around = blurred[..., 1] / np.maximum(blurred[..., 0], 1e-6)
     hollow = np.clip((filled - around) / 0.12, 0, 1)
     if not outlined:
         return np.asarray(1 - 0.55 * hollow, dtype=np.float32)

@@ -179,8 +179,8 @@ class RunData:
 
 def steps(values: Array) -> Array:
     """How far a quantity moved since the frame before: [F] for [F] or [F, D]; NaN at the first and next to a gap."""
-    moved = np.diff(values.reshape(len(values), -1), axis=0)
-    return np.concatenate([[np.nan], np.linalg.norm(moved, axis=1)])
+    moved = np.diff(values[:, None] if values.ndim == 1 else values, axis=0)
+    return np.concatenate([[np.nan], np.linalg.norm(moved, axis=1)])[: len(values)]
 
 
 def jumps(values: Array, least: float) -> NDArray[np.bool_]:

@@ -23,13 +23,11 @@ def summary(run: RunData) -> Rows:
         ("no person", f"{frames - found} ({_percent(frames - found, frames)})"),
         ("not reliable", f"{int((run.found & ~run.reliable).sum())} of the frames with a person"),
         ("energy (eq. 2)", _median_p95(run.energy, 1.0, "", 3)),
-        ("process time", _median_p95(run.total_ms, 1.0, " ms per frame", 1)),
-        ("expected joint error", _median_p95(run.sigma[:, [JOINT[n] for n in LIMB_JOINTS]], 1000.0, " mm (sigma)", 0)),
+        ("process time per frame", _median_p95(run.total_ms, 1.0, " ms", 1)),
+        ("expected joint error (sigma)", _median_p95(run.sigma[:, [JOINT[n] for n in LIMB_JOINTS]], 1000.0, " mm", 0)),
     ]
     if run.consecutive:
-        broken = {name: int(at.sum()) for name, at in joint_jumps(run).items() if at.any()}
-        worst = ", ".join(f"{name} {n}" for name, n in sorted(broken.items(), key=lambda item: -item[1])[:4])
-        rows.append(("jumps", f"{sum(broken.values())} in {len(broken)} joints ({worst})" if broken else "none"))
+        rows.append(("jumps", _jumps(run)))
     error = run.error_m
     if error is not None:
         limbs = error[:, [JOINT[name] for name in LIMB_JOINTS]]
@@ -60,6 +58,15 @@ def error_table(run: RunData) -> list[list[str]]:
     return table
 
 
+def _jumps(run: RunData) -> str:
+    """How many frames break the path of some joint, and the first of them."""
+    frames = np.flatnonzero(np.any(list(joint_jumps(run).values()), axis=0))
+    if not len(frames):
+        return "none"
+    listed = ", ".join(str(f) for f in frames[:8]) + (", ..." if len(frames) > 8 else "")
+    return f"{len(frames)} of {len(run.joints)} frames ({listed})"
+
+
 def _seconds(run: RunData) -> str:
     return f"{run.seconds[-1]:.2f} s"
 
@@ -76,4 +83,4 @@ def _median_p95(values: Array, scale: float, unit: str, digits: int) -> str:
     known = scale * values[np.isfinite(values)]
     if not len(known):
         return "unknown"
-    return f"median {np.median(known):.{digits}f}{unit}, 95th percentile {np.percentile(known, 95):.{digits}f}{unit}"
+    return f"median {np.median(known):.{digits}f}{unit}, 95 % below {np.percentile(known, 95):.{digits}f}{unit}"
