@@ -111,7 +111,6 @@ class Diagnostics:
         return check
 
     def value(self, name: str, key: str) -> str:
-        """One value of the newest entry."""
+        """One value of the newest entry; empty while there is none."""
         status = self[name]
-        assert status is not None, name
-        return next(pair.value for pair in status.values if pair.key == key)
+        return "" if status is None else next(pair.value for pair in status.values if pair.key == key)
