@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 #: The default motions of one round; the first three come in this order, the others are shuffled by the seed.
 PLAYLIST: tuple[str, ...] = (
     "wave", "arms_up", "dance",
-    "reach", "squat", "kick", "sit", "stretch", "twirl", "point", "jump", "t_pose", "punch", "spin_kick",
+    "reach", "squat", "kick", "sit", "stretch", "twirl", "point", "jump", "t_pose", "punch",
 )  # fmt: skip
 
 #: The root stays within this distance of the room's centre once the person has come in, m.

@@ -1,0 +1,482 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The simulated person, room and cameras: truth that is true, pictures that follow from it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from limbloc_ros.core.camera import Camera, Rig
+from limbloc_ros.core.errors import ConfigError, InputError, RigError
+from limbloc_ros.core.pose import JOINT, JOINT_NAMES
+from limbloc_ros.simulation import _quaternions as quat
+from limbloc_ros.simulation import _render_kernels as kernels
+from limbloc_ros.simulation.motion import PLAYLIST, Motion, motion_names
+from limbloc_ros.simulation.person import PERSON_NAMES, load_person
+from limbloc_ros.simulation.retarget import LINK, LINKS, Retarget
+from limbloc_ros.simulation.room import SimulatedRoom, default_rig
+from limbloc_ros.simulation.surroundings import backdrop
+
+TIMES = np.arange(1.6, 60.0, 1.37)
+
+
+@pytest.fixture(scope="module")
+def man_motion() -> Motion:
+    return Motion(load_person("man"), seed=0)
+
+
+@pytest.fixture(scope="module")
+def room() -> SimulatedRoom:
+    return SimulatedRoom(default_rig(4, 320, 240), "man", seed=3)
+
+
+def neutral(**links: np.ndarray) -> np.ndarray:
+    """Link rotations of a straight body, but for some links."""
+    rotations = np.tile([1.0, 0.0, 0.0, 0.0], (len(LINKS), 1))
+    for name, q in links.items():
+        rotations[LINK[name]] = q
+    return rotations
+
+
+def pose(name: str = "man", **links: np.ndarray) -> dict[str, np.ndarray]:
+    """Joints by name of a person whose root bone stands 1 m above the origin."""
+    person = load_person(name)
+    posed = person.pose(Retarget(person).bone_rotations(neutral(**links)), [0, 0, 1])
+    return dict(zip(JOINT_NAMES, posed.joints, strict=True))
+
+
+# ---- person ----
+
+
+@pytest.mark.parametrize("name", PERSON_NAMES)
+def test_a_person_is_a_closed_body_of_plausible_size(name: str) -> None:
+    person = load_person(name)
+    assert 1.2 < person.stature_m < 1.9
+    a, b, c = (person.vertices[person.faces[:, k]] for k in range(3))
+    litres = 1000 * np.einsum("ij,ij->", a, np.cross(b, c)) / 6  # positive: faces are counter-clockwise from outside
+    assert 15 < litres / person.stature_m**2 < 40  # a density of 1 kg a litre makes this the body mass index
+    np.testing.assert_allclose(person.skin_weights.sum(1), 1.0, atol=1e-9)
+    assert (person.bone_parents[1:] < np.arange(1, len(person.bone_names))).all()
+    # Rest pose: looks along x, left is +y, soles on the floor.
+    assert person.rest_joint("toe_L")[0] > person.rest_joint("heel_L")[0] + 0.1
+    assert person.rest_joint("hand_L")[1] > 0.2 > -0.2 > person.rest_joint("hand_R")[1]
+    assert abs(person.vertices[:, 2].min()) < 0.01
+
+
+def test_people_differ_as_their_names_say() -> None:
+    people = {name: load_person(name) for name in PERSON_NAMES}
+    assert people["child"].stature_m < people["woman"].stature_m < people["man"].stature_m
+
+    def girth(name: str) -> float:
+        person = people[name]
+        waist = np.abs(person.vertices[:, 2] - person.rest_joint("torso_centre")[2]) < 0.08
+        return float(np.ptp(person.vertices[waist & (np.abs(person.vertices[:, 1]) < 0.25), 0]) / person.stature_m)
+
+    assert girth("heavy") > 1.15 * girth("woman")
+
+
+def test_skinning_equals_its_plain_reference() -> None:
+    person = load_person("woman")
+    rng = np.random.default_rng(0)
+    links = np.stack([quat.multiply(quat.about(1, a), quat.about(2, b)) for a, b in rng.uniform(-1, 1, (13, 2))])
+    rotations, root = Retarget(person).bone_rotations(links), np.array([0.3, -0.2, 0.9])
+    posed = person.pose(rotations, root)
+    position = np.zeros((len(person.bone_names), 3))
+    position[0] = root
+    for bone, parent in enumerate(person.bone_parents):
+        if parent >= 0:
+            position[bone] = position[parent] + rotations[parent] @ (
+                person.bone_heads[bone] - person.bone_heads[parent]
+            )
+    wanted = np.zeros_like(person.vertices)
+    for k in range(4):
+        bone = person.skin_bones[:, k]
+        moved = position[bone] + np.einsum("vij,vj->vi", rotations[bone], person.vertices - person.bone_heads[bone])
+        wanted += person.skin_weights[:, k : k + 1] * moved
+    np.testing.assert_allclose(posed.vertices, wanted, atol=1e-12)
+    np.testing.assert_allclose(posed.bone_positions, position, atol=1e-12)
+
+
+def test_identity_rotations_give_the_rest_pose() -> None:
+    person = load_person("child")
+    posed = person.pose(np.tile(np.eye(3), (len(person.bone_names), 1, 1)), person.bone_heads[0])
+    np.testing.assert_allclose(posed.vertices, person.vertices, atol=1e-12)
+    np.testing.assert_allclose(posed.joints, person.joint_rest, atol=1e-12)
+
+
+def test_bad_requests_for_a_person_say_what_was_expected() -> None:
+    with pytest.raises(InputError, match="man, woman, child, heavy, got 'dog'"):
+        load_person("dog")
+    with pytest.raises(InputError, match=r"expected shape \(34, 3, 3\)"):
+        load_person("man").pose(np.eye(3)[None], [0, 0, 0])
+
+
+# ---- retarget ----
+
+
+@pytest.mark.parametrize("name", PERSON_NAMES)
+def test_zero_is_a_straight_body_with_hanging_arms(name: str) -> None:
+    j = pose(name)
+    for side, left in (("L", 1), ("R", -1)):
+        for upper, lower in (("shoulder", "elbow"), ("elbow", "wrist"), ("hip", "knee"), ("knee", "ankle")):
+            bone = j[f"{lower}_{side}"] - j[f"{upper}_{side}"]
+            assert bone[2] / np.linalg.norm(bone) < -0.98
+        assert left * j[f"shoulder_{side}"][1] > 0.1
+        assert j[f"toe_{side}"][0] > j[f"heel_{side}"][0]
+
+
+@pytest.mark.parametrize(("side", "left"), [("L", 1.0), ("R", -1.0)])
+def test_links_bend_the_right_way_and_only_their_own_side(side: str, left: float) -> None:
+    other = "R" if side == "L" else "L"
+    straight = pose()
+    elbow = pose(**{f"elbow_{side}": quat.about(1, -np.pi / 2)})
+    forearm = elbow[f"wrist_{side}"] - elbow[f"elbow_{side}"]
+    assert forearm[0] / np.linalg.norm(forearm) > 0.98
+    knee = pose(**{f"knee_{side}": quat.about(1, np.pi / 2)})
+    shin = knee[f"ankle_{side}"] - knee[f"knee_{side}"]
+    assert shin[0] / np.linalg.norm(shin) < -0.98
+    raised = pose(**{f"shoulder_{side}": quat.about(0, left * np.pi / 2)})
+    arm = raised[f"elbow_{side}"] - raised[f"shoulder_{side}"]
+    assert left * arm[1] / np.linalg.norm(arm) > 0.98
+    for joint in ("elbow", "wrist", "knee", "ankle", "shoulder"):
+        for bent in (elbow, knee, raised):
+            np.testing.assert_allclose(bent[f"{joint}_{other}"], straight[f"{joint}_{other}"], atol=1e-12)
+
+
+def test_palms_face_the_thighs() -> None:
+    person = load_person("man")
+    posed = person.pose(Retarget(person).bone_rotations(neutral()), [0, 0, 1])
+    j = dict(zip(JOINT_NAMES, posed.joints, strict=True))
+    hand = posed.vertices[np.array(person.bone_names)[person.skin_bones[:, 0]] == "wrist.L"]
+    # A hand is flat: its thinnest direction is the palm's normal. It must point sideways, not forward.
+    _, _, axes = np.linalg.svd(hand - hand.mean(0))
+    assert abs(axes[2][1]) > 0.6
+    # The thumb points forward: the knuckles' side of the hand reaches further to the front than to the back.
+    assert hand[:, 0].max() - j["hand_L"][0] > j["hand_L"][0] - hand[:, 0].min()
+
+
+# ---- motion ----
+
+
+def test_the_room_is_empty_first_then_somebody_walks_in() -> None:
+    motion = Motion(load_person("man"), empty_s=2.0)
+    assert motion.pose(0.0) is None
+    assert motion.pose(1.999) is None
+    assert motion.action(1.0) == "empty"
+    first = motion.pose(2.0)
+    assert first is not None
+    assert motion.action(2.0) == "walk"
+    assert first.joints[JOINT["pelvis_centre"], 0] < -2.0  # at the door
+    later = motion.pose(8.0)
+    assert later is not None
+    assert np.linalg.norm(later.joints[JOINT["pelvis_centre"], :2]) < 1.0
+
+
+@pytest.mark.parametrize("name", PERSON_NAMES)
+def test_bone_lengths_never_change_and_joints_stay_in_the_body(name: str) -> None:
+    motion = Motion(load_person(name), seed=1)
+    pairs = [("shoulder", "elbow"), ("elbow", "wrist"), ("hip", "knee"), ("knee", "ankle"), ("ankle", "toe")]
+    index = np.array([[JOINT[f"{a}_{s}"], JOINT[f"{b}_{s}"]] for a, b in pairs for s in "LR"])
+    lengths = []
+    for t in TIMES:
+        posed = motion.pose(t)
+        assert posed is not None
+        lengths.append(np.linalg.norm(posed.joints[index[:, 0]] - posed.joints[index[:, 1]], axis=1))
+        low, high = posed.vertices.min(0), posed.vertices.max(0)
+        assert (posed.joints > low - 0.01).all()
+        assert (posed.joints < high + 0.01).all()
+    # A limb is two bones in line, whose axial twist differs: at most a millimetre off that line.
+    assert np.ptp(lengths, axis=0).max() < 1e-3
+    np.testing.assert_allclose(lengths[0][::2], lengths[0][1::2], rtol=0.02)
+
+
+def test_somebody_who_does_not_jump_touches_the_floor(man_motion: Motion) -> None:
+    highest = {}
+    for t in np.arange(1.6, man_motion.duration_s, 0.1):
+        posed = man_motion.pose(t)
+        assert posed is not None
+        lowest = posed.vertices[:, 2].min()
+        assert lowest > -1e-9
+        highest[man_motion.action(t)] = max(highest.get(man_motion.action(t), 0.0), float(lowest))
+        if man_motion.action(t) in ("wave", "squat", "sit", "reach", "arms_up", "t_pose"):
+            for side in "LR":
+                assert posed.joints[JOINT[f"ankle_{side}"], 2] < 0.16
+    assert highest["jump"] > 0.15
+    for action in ("wave", "squat", "sit", "reach", "stretch", "point", "dance"):
+        assert highest[action] < 0.08, action
+
+
+def test_feet_stay_where_they_are_during_planted_motions(man_motion: Motion) -> None:
+    times = [t for t in np.arange(1.6, man_motion.duration_s, 1 / 30) if man_motion.action(t) == "squat"]
+    ankles = np.array([man_motion.pose(t).joints[[JOINT["ankle_L"], JOINT["ankle_R"]], :2] for t in times[20:]])
+    assert np.ptp(ankles, axis=0).max() < 0.06
+
+
+def test_the_motion_has_no_jumps_not_even_where_it_repeats(man_motion: Motion) -> None:
+    # A fast kick reaches 13 m/s; a swapped limb or a teleport would be 20 m/s and more.
+    step = 1 / 60
+    times = np.arange(man_motion.empty_s, man_motion.empty_s + man_motion.duration_s + 3, step)
+    joints = np.array([man_motion.pose(t).joints for t in times])
+    speed = np.linalg.norm(np.diff(joints, axis=0), axis=-1).max(1) / step
+    assert speed.max() < 13.0
+    around_the_seam = np.abs(times[:-1] - man_motion.empty_s - man_motion.duration_s) < 0.3
+    assert around_the_seam.sum() > 20
+    assert speed[around_the_seam].max() < 5.0  # the next motion may start at once
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_person_stays_within_the_carve_volume(seed: int) -> None:
+    rig = default_rig()
+    motion = Motion(load_person("man"), seed=seed)
+    inside = []
+    for t in np.arange(6.0, 90.0, 0.5):
+        joints = motion.pose(t).joints
+        inside.append((joints > rig.volume_min) & (joints < rig.volume_max))
+        pelvis = joints[JOINT["pelvis_centre"], :2]
+        assert np.linalg.norm(pelvis) < 1.0
+    assert np.mean(inside) > 0.995
+
+
+def test_a_pose_is_a_pure_function_of_time_and_seed() -> None:
+    person = load_person("woman")
+    a, b, other = Motion(person, seed=5), Motion(person, seed=5), Motion(person, seed=6)
+    forwards = [a.pose(t).joints for t in TIMES]
+    backwards = [b.pose(t).joints for t in TIMES[::-1]][::-1]
+    np.testing.assert_array_equal(forwards, backwards)
+    assert np.abs(np.array([other.pose(t).joints for t in TIMES]) - forwards).max() > 0.3
+
+
+def test_every_motion_of_the_playlist_is_played(man_motion: Motion) -> None:
+    played = {man_motion.action(t) for t in np.arange(1.6, man_motion.duration_s, 0.2)}
+    assert played == {*PLAYLIST, "walk", "turn"}
+    wave = Motion(load_person("man"), playlist=["wave"])
+    assert {wave.action(t) for t in np.arange(1.6, 30, 0.2)} <= {"wave", "walk", "turn"}
+    assert "wave" in motion_names()
+    for bad, message in ((["fly"], "fly"), ([], "none at all")):
+        with pytest.raises(ConfigError, match=message):
+            Motion(load_person("man"), playlist=bad)
+    with pytest.raises(ConfigError, match="empty_s"):
+        Motion(load_person("man"), empty_s=-1.0)
+
+
+def test_waving_raises_the_right_hand_only() -> None:
+    motion = Motion(load_person("man"), playlist=["wave"])
+    times = [t for t in np.arange(1.6, 12, 0.1) if motion.action(t) == "wave"]
+    joints = np.array([motion.pose(t).joints for t in times])
+    head = joints[:, JOINT["head_centre"], 2]
+    assert (joints[:, JOINT["wrist_R"], 2] > head).any()
+    assert (joints[:, JOINT["wrist_L"], 2] < joints[:, JOINT["shoulder_L"], 2]).all()
+
+
+# ---- cameras and pictures ----
+
+
+@pytest.mark.parametrize("n", [2, 3, 4, 8, 16])
+def test_the_default_cameras_see_the_whole_person(n: int) -> None:
+    rig = default_rig(n)
+    assert len(rig.cameras) == n
+    person = load_person("man")
+    heights = [c.T_world_camera[2, 3] for c in rig.cameras]
+    assert min(heights) >= 1.2
+    assert max(heights) <= 2.8
+    for camera in rig.cameras:
+        uv, depth = camera.world_to_image(person.vertices)
+        assert (depth > 1.5).all()
+        assert (uv > 0).all()
+        assert (uv < [camera.width - 1, camera.height - 1]).all()
+        up, _ = camera.world_to_image([[0.0, 0.0, 0.2], [0.0, 0.0, 1.7]])
+        assert up[1, 1] < up[0, 1] - 100  # not upside down
+    for a, b in zip(rig.cameras, rig.cameras[1:], strict=False):
+        assert np.linalg.norm(a.T_world_camera[:3, 3] - b.T_world_camera[:3, 3]) > 0.5
+
+
+def test_impossible_rooms_are_refused() -> None:
+    for arguments, message in (((1,), "2 to 16, got 1"), ((17,), "got 17"), ((4, 10, 480), "got 10x480")):
+        with pytest.raises(RigError, match=message):
+            default_rig(*arguments)
+    rig = default_rig(2)
+    T = rig.cameras[0].T_world_camera.copy()
+    T[0, 3] = 9.0
+    outside = Rig((replace(rig.cameras[0], T_world_camera=T),), rig.volume_min, rig.volume_max)
+    with pytest.raises(RigError, match="cam0 stands at"):
+        SimulatedRoom(outside)
+    with pytest.raises(ConfigError, match="noise_sigma"):
+        SimulatedRoom(rig, noise_sigma=-1.0)
+    with pytest.raises(ConfigError, match="light_drift"):
+        SimulatedRoom(rig, light_drift=0.9)
+    with pytest.raises(RigError, match="no camera 'cam7'"):
+        SimulatedRoom(rig).render("cam7", 0.0)
+
+
+def test_one_camera_alone_draws_what_all_cameras_draw(room: SimulatedRoom) -> None:
+    frame = room.frame(7.3)
+    alone = SimulatedRoom(default_rig(4, 320, 240), "man", seed=3)
+    alone.render("cam2", 9.0)
+    for name in ("cam2", "cam0"):
+        image, mask = alone.render_with_mask(name, 7.3)
+        np.testing.assert_array_equal(image, frame.images[name])
+        np.testing.assert_array_equal(mask, frame.masks[name])
+    np.testing.assert_array_equal(alone.joints(7.3), frame.joints)
+    assert frame.images["cam2"].shape == (240, 320, 3)
+    assert frame.images["cam2"].dtype == frame.masks["cam2"].dtype == np.uint8
+
+
+def test_an_empty_room_has_no_joints_and_no_silhouette(room: SimulatedRoom) -> None:
+    frame = room.frame(0.5)
+    assert frame.joints is None
+    assert frame.action == "empty"
+    assert not any(mask.any() for mask in frame.masks.values())
+    assert room.frame(1.6).joints is not None
+
+
+@pytest.mark.parametrize("name", PERSON_NAMES)
+def test_true_joints_project_into_the_true_silhouette(name: str) -> None:
+    room = SimulatedRoom(default_rig(4), name, seed=2)
+    seen = 0
+    for t in (5.1, 9.7, 16.3, 23.9, 31.1, 44.4, 58.0):
+        frame = room.frame(t)
+        for camera in room.rig.cameras:
+            uv, _ = camera.world_to_image(frame.joints)
+            distance = cv2.distanceTransform(255 - frame.masks[camera.name], cv2.DIST_L2, 5)
+            within = ((uv > 3) & (uv < [camera.width - 4, camera.height - 4])).all(1)
+            u, v = np.round(uv[within]).astype(int).T
+            # Linear blend skinning pulls a strongly bent joint's skin in a little: allow 3 px.
+            assert distance[v, u].max() < 3.0
+            seen += within.sum()
+    assert seen > 0.9 * 7 * 4 * 25
+
+
+def test_the_silhouette_is_the_projected_mesh(room: SimulatedRoom) -> None:
+    t = 12.0
+    posed = room.motion.pose(t)
+    for camera in room.rig.cameras:
+        uv, _ = camera.world_to_image(posed.vertices)
+        # Drawn by OpenCV 8 times finer, then looked at in the pixels' centres.
+        fine = np.zeros((camera.height * 8, camera.width * 8), np.uint8)
+        for triangle in uv[room.person.faces]:
+            cv2.fillConvexPoly(fine, np.round(triangle * 8 * 16).astype(np.int32), 255, shift=4)
+        wanted, mask = fine[::8, ::8], room.render_with_mask(camera.name, t)[1]
+        assert (wanted > 0).sum() > 1000
+        assert np.sum(wanted != mask) < 0.03 * np.sum(wanted > 0)
+        assert not (mask & ~cv2.dilate(wanted, np.ones((3, 3)))).any()
+        assert not (cv2.erode(wanted, np.ones((3, 3))) & ~mask).any()
+
+
+def test_left_and_right_look_different_from_the_front() -> None:
+    """The waving right hand appears left of the head to a camera that the person looks at."""
+    room = SimulatedRoom(default_rig(8), "man", playlist=["wave"])
+    t = next(t for t in np.arange(2, 12, 0.05) if room.motion.action(t) == "wave") + 1.0
+    joints = room.joints(t)
+    facing = np.cross(joints[JOINT["hip_L"]] - joints[JOINT["hip_R"]], [0, 0, 1])
+    camera = max(room.rig.cameras, key=lambda c: facing @ (c.T_world_camera[:3, 3] - joints[JOINT["head_centre"]]))
+    uv, _ = camera.world_to_image(joints)
+    wrist, head = uv[JOINT["wrist_R"]], uv[JOINT["head_centre"]]
+    assert wrist[0] < head[0] - 10
+    mask = room.render_with_mask(camera.name, t)[1]
+    assert mask[int(wrist[1]), int(wrist[0])] == 255
+
+
+@pytest.mark.parametrize(
+    ("model", "coefficients"),
+    [
+        ("none", []),
+        ("radtan", [-0.2, 0.05, 0.002, -0.003]),
+        ("radtan", [-0.2, 0.05, 0.002, -0.003, 0.01]),
+        ("rational", [0.1, -0.05, 0.001, 0.002, 0.01, 0.2, 0.03, -0.01]),
+    ],
+)
+def test_the_fast_projection_equals_the_cameras(model: str, coefficients: list[float]) -> None:
+    base = default_rig(3).cameras[1]
+    camera = Camera("c", 640, 480, base.K, base.T_world_camera, np.array(coefficients), model)
+    points = np.random.default_rng(0).uniform([-1, -1, 0], [1, 1, 2], (200, 3))
+    points[0] = camera.T_world_camera[:3, 3] - camera.T_world_camera[:3, 2]  # behind the camera
+    uv, depth = np.empty((200, 2)), np.empty(200)
+    T, k = camera.T_camera_world, np.zeros(8)
+    k[: len(coefficients)] = coefficients
+    kernels.project(points, T[:3, :3], T[:3, 3], camera.K, k, uv, depth)
+    wanted, wanted_depth = camera.world_to_image(points)
+    np.testing.assert_allclose(uv, wanted, atol=1e-7)
+    np.testing.assert_allclose(depth, wanted_depth, atol=1e-12)
+    assert np.isnan(uv[0]).all()
+
+
+def test_a_fisheye_camera_sees_the_person_where_it_projects_him() -> None:
+    rig = default_rig(2)
+    cameras = tuple(
+        replace(c, distortion=np.array([0.02, -0.01, 0.0, 0.0]), distortion_model="fisheye") for c in rig.cameras
+    )
+    room = SimulatedRoom(Rig(cameras, rig.volume_min, rig.volume_max))
+    frame = room.frame(6.0)
+    for camera in cameras:
+        uv, _ = camera.world_to_image(frame.joints[JOINT["torso_centre"]])
+        assert frame.masks[camera.name][int(uv[1]), int(uv[0])] == 255
+
+
+def test_the_floor_lies_where_the_camera_projects_it() -> None:
+    camera = default_rig(4, 320, 240).cameras[0]
+    floor = backdrop(camera, seed=0).floor_m
+    v, u = np.nonzero(~np.isnan(floor[..., 0]))
+    assert len(v) > 10_000
+    ground = np.concatenate([floor[v, u], np.zeros((len(v), 1))], axis=1)[::97]
+    uv, _ = camera.world_to_image(ground)
+    np.testing.assert_allclose(uv, np.stack([u, v], axis=1)[::97], atol=0.02)
+
+
+def quiet_room(**changes: object) -> SimulatedRoom:
+    return SimulatedRoom(default_rig(4, 320, 240), seed=3, **{"noise_sigma": 0.0, "light_drift": 0.0, **changes})
+
+
+def test_noise_has_the_wanted_spread_and_is_new_in_every_frame_and_camera() -> None:
+    clean, noisy = quiet_room(), quiet_room(noise_sigma=3.0)
+    noise = []
+    for name, t in (("cam0", 0.0), ("cam0", 0.04), ("cam1", 0.0)):
+        background = clean.render(name, t).astype(float)
+        difference = noisy.render(name, t) - background
+        noise.append(difference[(background > 20) & (background < 235)][:100_000])
+    for values in noise:
+        assert abs(values.std() - 3.0) < 0.1
+        assert abs(values.mean()) < 0.05
+    for a, b in ((0, 1), (0, 2), (1, 2)):
+        assert abs(np.corrcoef(noise[a], noise[b])[0, 1]) < 0.02
+    np.testing.assert_array_equal(noisy.render("cam0", 0.04), quiet_room(noise_sigma=3.0).render("cam0", 0.04))
+
+
+def test_light_drifts_slowly_and_no_further_than_asked() -> None:
+    room, still = quiet_room(light_drift=0.05), quiet_room()
+    reference = still.render("cam0", 0.0).mean()
+    level = np.array([room.render("cam0", t).mean() / reference for t in np.arange(0.0, 1.5, 0.04)])
+    assert np.abs(np.diff(level)).max() < 0.002
+    # Away from the empty start the person changes the mean: compare the ceiling and walls at the image's top only.
+    tops = [room.render("cam0", t)[:20].mean() / still.render("cam0", t)[:20].mean() for t in np.arange(0, 120, 3.0)]
+    assert 0.04 < np.ptp(tops) < 0.105
+
+
+def test_the_person_throws_a_shadow_on_the_floor_and_changes_nothing_else() -> None:
+    room = quiet_room()
+    empty = room.render("cam0", 0.0).astype(int)
+    image, mask = room.render_with_mask("cam0", 7.0)
+    change = np.abs(image.astype(int) - empty).max(-1)
+    outside = cv2.dilate(mask, np.ones((5, 5))) == 0
+    floor = ~np.isnan(backdrop(room.rig.camera("cam0"), 3).floor_m[..., 0])
+    assert change[outside & ~floor].max() == 0
+    shadow = outside & floor & (change > 8)
+    assert shadow.sum() > 200
+    assert (image[shadow].astype(int) <= empty[shadow]).all()
+    ratio = image[shadow] / np.maximum(empty[shadow], 1)
+    assert ratio.min() > 0.35
+    assert np.ptp(ratio, axis=1).max() < 0.1  # a shadow keeps the colour
+
+
+def test_clothes_come_close_to_the_background_in_places_but_mostly_differ() -> None:
+    room = quiet_room()
+    contrasts = []
+    for name in room.rig.names:
+        empty = room.render(name, 0.0).astype(int)
+        image, mask = room.render_with_mask(name, 7.0)
+        contrasts.append(np.abs(image.astype(int) - empty).max(-1)[mask > 0])
+    contrast = np.concatenate(contrasts)
+    assert np.mean(contrast > 12) > 0.85
+    assert np.mean(contrast <= 12) > 0.003
