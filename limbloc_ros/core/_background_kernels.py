@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compiled loops of `background`: the per-pixel Gaussian test with its update, the light gain, and hysteresis.
 
-The state is planar ([channel, height, width], float32) because the compiler then handles eight pixels at a time.
+The state is planar ([channel, height, width]) because the compiler then handles eight pixels at a time. What every
+frame reads of it is kept a second time in 16-bit fixed point: the loop over the image waits for memory, not for sums.
 """
 
 from __future__ import annotations
@@ -11,12 +12,18 @@ from numba import njit
 from numpy.typing import NDArray
 
 Bytes = NDArray[np.uint8]
+Words = NDArray[np.uint16]
 Floats = NDArray[np.float32]
 
 CHANGE_SCALE = 2.0
 """Grey levels of the change map per sigma (the map ends at 127 sigma)."""
 COLOUR_SCALE = 8.0
 """Grey levels of the colour map per sigma (the map ends at 32 sigma)."""
+
+LEVEL_SCALE = 128.0
+"""Fixed point of the means: units per grey level (256 grey levels fit into 15 bits)."""
+SHARPNESS_SCALE = 4096.0
+"""Fixed point of one over sigma: units at a sigma of one grey level (a sigma of 0.1 fits into 16 bits)."""
 
 STRIP = 320
 """Pixels that are worked on at a time; their intermediate sums stay in the fastest cache."""
@@ -26,65 +33,51 @@ _VECTOR = {"nnan", "ninf", "nsz", "contract", "reassoc"}
 
 
 @njit(cache=True, fastmath=_VECTOR, error_model="numpy")
-def measure_and_update(
+def measure(
     image: Bytes,
-    mean: Floats,
-    variance: Floats,
-    busy: Bytes,
+    level: Words,
+    sharpness: Words,
     gain: Floats,
-    floor_variance: np.float32,
-    weight: np.float32,
     darkest: np.float32,
     brightest: np.float32,
-    limit: np.float32,
-    rate: np.float32,
     change: Bytes,
     colour: Bytes,
 ) -> None:
-    """Measure how far every pixel is from its background, and learn from those that are near.
+    """Measure how far every pixel is from its background.
 
     Args:
         image: [3, H, W] the frame, planar.
-        mean, variance: [3, H, W] the model, changed in place.
-        busy: [H, W] non-zero where nothing may be learned (the last frame's foreground and its rim).
+        level: [3, H, W] means in grey levels * LEVEL_SCALE.
+        sharpness: [3, H, W] SHARPNESS_SCALE over the standard deviation.
         gain: [3] brightness of the light now over that of the model.
-        floor_variance: added to every variance, grey levels squared.
-        weight: 1, or 1/3 when the three channels are copies of one.
         darkest, brightest: shadows and highlights scale the background by a factor in this range.
-        limit: pixels beyond this many sigmas are not learned.
-        rate: weight of the new pixel.
         change: [H, W] out, distance to the background in sigmas * CHANGE_SCALE.
         colour: [H, W] out, what of it no shadow or highlight explains, in sigmas * COLOUR_SCALE.
     """
     height, width = change.shape
-    top, near_white = np.float32(255), np.float32(254)
-    limit2 = limit * limit
+    top = np.float32(255)
     # Sums over the channels live in one scratch row at constant offsets: few pointers, so that the compiler can prove
     # that the loops may run on vectors. Their rounding (1e-2 sigma squared) is far below any threshold.
-    scratch = np.empty(5 * STRIP, dtype=np.float32)
+    scratch = np.empty(3 * STRIP, dtype=np.float32)
     for y in range(height):
         for start in range(0, width, STRIP):
             n = min(STRIP, width - start)
+            for x in range(3 * STRIP):
+                scratch[x] = np.float32(0)
             for c in range(3):
-                pixel, m, v = image[c, y, start : start + n], mean[c, y, start : start + n], variance[c, y, start : start + n]
-                g = gain[c]
-                if c == 0:
-                    for x in range(n):
-                        scratch[x] = np.float32(0)
-                        scratch[x + STRIP] = np.float32(0)
-                        scratch[x + 2 * STRIP] = np.float32(0)
-                        scratch[x + 3 * STRIP] = np.float32(0)
+                pixel = image[c, y, start : start + n]
+                means = level[c, y, start : start + n]
+                sharp = sharpness[c, y, start : start + n]
+                g = gain[c] * np.float32(1.0 / LEVEL_SCALE)
                 for x in range(n):
-                    now = np.float32(pixel[x])
-                    expected = min(g * m[x], top)
-                    precision = weight / (v[x] + floor_variance)
-                    off = now - expected
-                    scaled = expected * precision
-                    scratch[x] += off * off * precision
-                    scratch[x + STRIP] += off * scaled
-                    scratch[x + 2 * STRIP] += expected * scaled
-                    scratch[x + 3 * STRIP] = max(scratch[x + 3 * STRIP], now)
-            out_change, out_colour, skip = change[y, start : start + n], colour[y, start : start + n], busy[y, start : start + n]
+                    expected = min(g * np.float32(means[x]), top)
+                    per_sigma = np.float32(sharp[x]) * np.float32(1.0 / SHARPNESS_SCALE)
+                    off = (np.float32(pixel[x]) - expected) * per_sigma
+                    expected *= per_sigma
+                    scratch[x] += off * off
+                    scratch[x + STRIP] += off * expected
+                    scratch[x + 2 * STRIP] += expected * expected
+            out_change, out_colour = change[y, start : start + n], colour[y, start : start + n]
             for x in range(n):
                 far2 = scratch[x]
                 along = scratch[x + STRIP]
@@ -94,17 +87,77 @@ def measure_and_update(
                 rest2 = max(far2 - t * (np.float32(2) * along - t * length2), np.float32(0))
                 out_change[x] = np.uint8(np.int32(min(np.float32(CHANGE_SCALE) * np.sqrt(far2), top)))
                 out_colour[x] = np.uint8(np.int32(min(np.float32(COLOUR_SCALE) * np.sqrt(rest2), top)))
-                near = (far2 < limit2) & (skip[x] == 0) & (scratch[x + 3 * STRIP] < near_white)
-                scratch[x + 4 * STRIP] = rate if near else np.float32(0)
-            if rate > 0:
-                for c in range(3):
-                    pixel, m, v = image[c, y, start : start + n], mean[c, y, start : start + n], variance[c, y, start : start + n]
-                    inverse = np.float32(1) / gain[c]
-                    for x in range(n):
-                        learn = scratch[x + 4 * STRIP]
-                        off = np.float32(pixel[x]) * inverse - m[x]
-                        v[x] = (np.float32(1) - learn) * (v[x] + learn * off * off)
-                        m[x] += learn * off
+
+
+@njit(cache=True, fastmath=_VECTOR, error_model="numpy")
+def fix(
+    mean: Floats, variance: Floats, floor_variance: np.float32, weight: np.float32, level: Words, sharpness: Words
+) -> None:
+    """Write one row of the model (all [W]) in the fixed point that `measure` reads; arguments as in `learn`."""
+    top = np.float32(65535)
+    for x in range(mean.size):
+        level[x] = np.uint16(np.int32(min(max(mean[x], np.float32(0)) * np.float32(LEVEL_SCALE) + np.float32(0.5), top)))
+    for x in range(mean.size):
+        sharp = np.float32(SHARPNESS_SCALE) * np.sqrt(weight / (variance[x] + floor_variance))
+        sharpness[x] = np.uint16(np.int32(min(sharp + np.float32(0.5), top)))
+
+
+@njit(cache=True)
+def fix_all(
+    mean: Floats, variance: Floats, floor_variance: np.float32, weight: np.float32, level: Words, sharpness: Words
+) -> None:
+    """`fix` for the whole model, all [3, H, W]."""
+    for c in range(mean.shape[0]):
+        for y in range(mean.shape[1]):
+            fix(mean[c, y], variance[c, y], floor_variance, weight, level[c, y], sharpness[c, y])
+
+
+@njit(cache=True, fastmath=_VECTOR, error_model="numpy")
+def learn(
+    image: Bytes,
+    mean: Floats,
+    variance: Floats,
+    level: Words,
+    sharpness: Words,
+    gain: Floats,
+    busy: Bytes,
+    change: Bytes,
+    limit: np.float32,
+    rate: np.float32,
+    floor_variance: np.float32,
+    weight: np.float32,
+    first: int,
+    step: int,
+) -> None:
+    """Running Gaussian average: move mean and variance of background pixels towards the frame, in place.
+
+    Args:
+        image, level, sharpness, gain, change: as in `measure`.
+        mean, variance: [3, H, W] grey levels and their square, without the floor.
+        busy: [H, W] non-zero where nothing may be learned (foreground and its rim).
+        limit: pixels with a `change` of this or more are not learned.
+        rate: weight of the new pixel.
+        floor_variance: added to every variance before it is turned into a sharpness.
+        weight: 1, or 1/3 when the three channels are copies of one.
+        first, step: rows first, first + step, ... are learned.
+    """
+    height, width = busy.shape
+    one, zero = np.float32(1), np.float32(0)
+    weights = np.empty(width, dtype=np.float32)
+    for y in range(first, height, step):
+        skip, far = busy[y], change[y]
+        for x in range(width):
+            weights[x] = rate if (skip[x] == 0) & (np.float32(far[x]) < limit) else zero
+        for c in range(3):
+            pixel, m, v = image[c, y], mean[c, y], variance[c, y]
+            inverse = one / gain[c]
+            for x in range(width):
+                # A clipped pixel says only that the light is at least this bright.
+                w = weights[x] if np.float32(pixel[x]) < np.float32(254) else zero
+                off = np.float32(pixel[x]) * inverse - m[x]
+                v[x] = (one - w) * (v[x] + w * off * off)
+                m[x] += w * off
+            fix(m, v, floor_variance, weight, level[c, y], sharpness[c, y])
 
 
 @njit(cache=True)

@@ -374,3 +374,22 @@ def flesh_distance(query: Any, parts: Any, points: Any, radii: Any) -> Any:
                 nearest[q] = p
         out[q] = best
     return out, nearest
+
+
+@njit(cache=True)  # type: ignore[misc, unused-ignore]
+def turned(rotations: Any, angles: Any, dof_bones: Any, dof_axes: Any) -> Any:
+    """Each bone's rotation [B, 3, 3] followed by the rotation vector of its degrees of freedom (rad)."""
+    out = rotations.copy()
+    vectors = np.zeros((len(rotations), 3))
+    for d in range(len(dof_bones)):
+        for i in range(3):
+            vectors[dof_bones[d], i] += dof_axes[d, i] * angles[d]
+    for b in range(len(rotations)):
+        if vectors[b, 0] != 0.0 or vectors[b, 1] != 0.0 or vectors[b, 2] != 0.0:
+            E = exp_so3(vectors[b])
+            for i in range(3):
+                for j in range(3):
+                    out[b, i, j] = (
+                        rotations[b, i, 0] * E[0, j] + rotations[b, i, 1] * E[1, j] + rotations[b, i, 2] * E[2, j]
+                    )
+    return out

@@ -28,9 +28,11 @@ from limbloc_ros.core._background_kernels import (
     CHANGE_SCALE,
     COLOUR_SCALE,
     densest_mean,
+    fix_all,
     grow_from_seeds,
+    learn,
     light_gain,
-    measure_and_update,
+    measure,
 )
 from limbloc_ros.core.config import BackgroundConfig, validated
 from limbloc_ros.core.errors import InputError
@@ -44,7 +46,20 @@ REFERENCE_PIXELS = 640 * 480
 PATIENCE = 3
 """Frames in a row that must disagree with the whole background before it is learned anew (a flash is shorter)."""
 
+LEARNED_ROWS = 8
+"""Every row of pixels learns from every eighth image, with a rate to match: nearly the same background for less time."""
+
+BODY_BORDER = 0.7
+"""A part that looks like shadow is body when its border runs along foreground this much of the way along background."""
+
+CLOTH_COLOUR = 0.6
+"""... and when its colour differs from the background's by more than this part of `shadow_sigmas` on average."""
+
+HALO_FRACTION = 0.3
+"""The halo around a person has less than this part of the change at the outline."""
+
 _OUTLINE = np.ones((5, 5), dtype=np.uint8)
+_HALO = np.ones((13, 13), dtype=np.uint8)
 _GRADIENT_BINS = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, float("inf"))
 
 
@@ -100,12 +115,15 @@ class BackgroundModel:
     def _forget(self) -> None:
         self._mean = np.zeros((3, 0, 0), dtype=np.float32)
         self._variance = self._mean.copy()
+        self._level = np.zeros(self._mean.shape, dtype=np.uint16)
+        self._sharpness = self._level.copy()
         self._gain = np.ones(3, dtype=np.float32)
         self._busy = np.zeros((0, 0), dtype=np.uint8)
         self._learned = 0
         self._ready = False
         self._noise_known = False
         self._upset = 0
+        self._turn = 0
 
     @property
     def config(self) -> BackgroundConfig:
@@ -117,6 +135,7 @@ class BackgroundModel:
         if config.max_pixels != self._config.max_pixels:
             self.recapture()
         self._config = validated(config)
+        self._fix_model()
 
     @property
     def learning(self) -> bool:
@@ -175,7 +194,8 @@ class BackgroundModel:
                     cv2.resize(mean, size, interpolation=cv2.INTER_AREA),
                     cv2.resize(sigma * sigma, size, interpolation=cv2.INTER_AREA),
                 )
-            self._allocate(planes) if c == 0 else None
+            if c == 0:
+                self._allocate(planes)
             self._mean[c], self._variance[c] = planes_c
         self._learned = 1
         self._ready = True
@@ -210,6 +230,8 @@ class BackgroundModel:
         self._upset = 0
         mask = self._clean(change, changed, colour, threshold)
         self._busy = cv2.dilate(mask, _OUTLINE)
+        if not self._frozen and self._config.learning_rate > 0:
+            self._follow(planes, change, threshold)
         fraction = cv2.countNonZero(mask) / mask.size
         return Segmentation(self._full_size(mask), False, self._learned, fraction, False, self._gain_tuple())
 
@@ -254,8 +276,8 @@ class BackgroundModel:
         return cv2.threshold(smooth, 127, 255, cv2.THRESH_BINARY)[1]
 
     def _stride(self) -> int:
-        """Sampling of the gain: about 5000 pixels whatever the image's size."""
-        return max(1, int(np.sqrt(self._busy.size / 5000.0)))
+        """Sampling of the gain: about 3000 pixels whatever the image's size."""
+        return max(1, int(np.sqrt(self._busy.size / 3000.0)))
 
     def _gain_tuple(self) -> tuple[float, float, float]:
         return float(self._gain[0]), float(self._gain[1]), float(self._gain[2])
@@ -290,6 +312,7 @@ class BackgroundModel:
             # A variance from a few frames is itself noisy; neighbours share their camera's noise.
             for c in range(3):
                 self._variance[c] = cv2.blur(self._variance[c] / np.float32(self._learned - 1), (5, 5))
+        self._fix_model()
 
     def _estimate_noise(self, planes: Bytes) -> None:
         """Take each pixel's noise from how much pixels of equal background contrast differ from the background.
@@ -310,28 +333,56 @@ class BackgroundModel:
                 here = (slope >= low) & (slope < high)
                 self._variance[c][here] = np.maximum(self._variance[c][here], np.float32(sigma * sigma))
         self._noise_known = True
+        self._fix_model()
+
+    def _fix_model(self) -> None:
+        weight, floor = self._weight_and_floor()
+        self._level = np.empty(self._mean.shape, dtype=np.uint16)
+        self._sharpness = np.empty_like(self._level)
+        fix_all(self._mean, self._variance, floor, weight, self._level, self._sharpness)
+
+    def _weight_and_floor(self) -> tuple[np.float32, np.float32]:
+        # Three copies of one channel must not count as three measurements.
+        return np.float32(1 / 3 if self._grey else 1), np.float32(self._config.sigma_floor**2)
 
     def _measure(self, planes: Bytes) -> tuple[Bytes, Bytes]:
-        config = self._config
+        darkest, brightest = self._config.shadow_darkest, self._config.highlight_brightest
+        if self._grey:
+            darkest = brightest = 1.0
         change = np.empty(planes.shape[1:], dtype=np.uint8)
         colour = np.empty_like(change)
-        no_shadow = self._grey
-        measure_and_update(
+        measure(
             planes,
-            self._mean,
-            self._variance,
-            self._busy,
+            self._level,
+            self._sharpness,
             self._gain,
-            np.float32(config.sigma_floor**2),
-            np.float32(1 / 3 if self._grey else 1),
-            np.float32(1 if no_shadow else config.shadow_darkest),
-            np.float32(1 if no_shadow else config.highlight_brightest),
-            np.float32(config.threshold_sigmas),
-            np.float32(0 if self._frozen else config.learning_rate),
+            np.float32(darkest),
+            np.float32(brightest),
             change,
             colour,
         )
         return change, colour
+
+    def _follow(self, planes: Bytes, change: Bytes, threshold: int) -> None:
+        """Let the background pixels of this image's share of rows learn."""
+        weight, floor = self._weight_and_floor()
+        learn(
+            planes,
+            self._mean,
+            self._variance,
+            self._level,
+            self._sharpness,
+            self._gain,
+            self._busy,
+            change,
+            np.float32(threshold),
+            np.float32(1.0 - (1.0 - self._config.learning_rate) ** LEARNED_ROWS),
+            floor,
+            weight,
+            self._turn,
+            LEARNED_ROWS,
+        )
+        self._turn = (self._turn + 1) % LEARNED_ROWS
 
     def _light_jumped(self, planes: Bytes) -> Segmentation:
         self._upset += 1
@@ -360,8 +411,6 @@ class BackgroundModel:
         weak[[0, -1], :] = 0
         weak[:, [0, -1]] = 0
         full = grow_from_seeds(weak, strong)
-        # The outermost pixels cannot be judged by their neighbours: they follow the next ones.
-        _drop_blobs(full, blob / 2)
         x, y, w, h = cv2.boundingRect(full)
         if w == 0:
             return full
@@ -370,15 +419,19 @@ class BackgroundModel:
         columns = slice(max(x - pad, 0), x + w + pad)
         mask = np.ascontiguousarray(full[rows, columns])
         change, changed = np.ascontiguousarray(change[rows, columns]), changed[rows, columns]
+        colour = colour[rows, columns]
         mask = _morph(mask, cv2.MORPH_OPEN, config.open_px * scale)
         mask = _morph(mask, cv2.MORPH_CLOSE, config.close_px * scale)
-        _fill_holes(mask, changed, threshold, hole)
+        mask = _fill_bites(mask, changed, colour, threshold, weak_colour)
+        _tidy(mask, changed, colour, threshold, weak_colour, blob, hole)
         if config.edge_fraction > 0:
-            mask = _trim_outline(mask, change, config.edge_fraction)
+            # First the wide faint halo that video codecs draw around things, then the blur of the outline itself.
+            mask = _trim_outline(mask, change, HALO_FRACTION * config.edge_fraction, _HALO)
+            mask = _trim_outline(mask, change, config.edge_fraction, _OUTLINE)
             mask = _morph(mask, cv2.MORPH_CLOSE, 1.0)
-        _drop_blobs(mask, blob)
-        _fill_holes(mask, changed, threshold, hole)
+            _tidy(mask, changed, colour, threshold, weak_colour, blob, hole)
         full[rows, columns] = mask
+        # The outermost pixels cannot be judged by their neighbours: they follow the next ones.
         full[0], full[-1] = full[1], full[-2]
         full[:, 0], full[:, -1] = full[:, 1], full[:, -2]
         return full
@@ -441,52 +494,77 @@ def _morph(mask: Bytes, operation: int, radius: float) -> Bytes:
     return cv2.morphologyEx(mask, operation, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)))
 
 
-def _drop_blobs(mask: Bytes, area: float) -> None:
-    """Erase, in place, outer outlines that enclose less than `area` px."""
-    contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    small = [c for c in contours if _enclosed(c) < area]
-    if small:
-        cv2.drawContours(mask, small, -1, 0, cv2.FILLED)
+def _tidy(
+    mask: Bytes, changed: Bytes, colour: Bytes, threshold: int, weak_colour: int, blob: float, hole: float
+) -> None:
+    """In place: erase blobs of less than `blob` px, fill holes of less than `hole` px or that are no real holes.
 
-
-def _enclosed(contour: NDArray[np.int32]) -> float:
-    """Pixels inside a closed outline including its own (Pick's theorem)."""
-    return cv2.contourArea(contour) + len(contour) / 2 + 1
-
-
-def _fill_holes(mask: Bytes, changed: Bytes, threshold: int, area: float) -> None:
-    """Fill, in place, holes that are small, or that are mostly changed and only look like shadow.
-
-    A true hole, seen between arm and trunk, shows the background itself; a hole that is merely the background's
-    colour under less light is more likely cloth.
+    A true hole, seen between arm and trunk, shows the background itself. A hole that is mostly changed and merely has
+    nearly the background's colour under less light is cloth.
     """
     contours, hierarchy = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
     if hierarchy is None:
         return
-    fill = []
+    erase, fill = [], []
     for contour, links in zip(contours, hierarchy[0], strict=True):
+        # Pick's theorem: the polygon through the pixel centres misses half of its own pixels, less one. A hole's
+        # outline runs on the foreground around it.
+        area, rim = cv2.contourArea(contour), len(contour) / 2
         if links[3] < 0:
-            continue
-        # A hole's outline runs on the foreground around it.
-        if cv2.contourArea(contour) - len(contour) / 2 + 1 < area:
-            fill.append(contour)
-            continue
-        x, y, w, h = cv2.boundingRect(contour)
-        inside = np.zeros((h, w), dtype=np.uint8)
-        cv2.drawContours(inside, [contour - (x, y)], -1, 255, cv2.FILLED)
-        hole = (inside > 0) & (mask[y : y + h, x : x + w] == 0)
-        if 2 * np.count_nonzero(hole & (changed[y : y + h, x : x + w] >= threshold)) > np.count_nonzero(hole):
+            if area + rim + 1 < blob:
+                erase.append(contour)
+        elif area - rim + 1 < hole or _looks_like_cloth(contour, mask, changed, colour, threshold, weak_colour):
             fill.append(contour)
     if fill:
         cv2.drawContours(mask, fill, -1, 255, cv2.FILLED)
+    if erase:
+        cv2.drawContours(mask, erase, -1, 0, cv2.FILLED)
 
 
-def _trim_outline(mask: Bytes, change: Bytes, fraction: float) -> Bytes:
-    """Drop outline pixels whose change is below `fraction` of the largest one within two pixels.
+def _fill_bites(mask: Bytes, changed: Bytes, colour: Bytes, threshold: int, weak_colour: int) -> Bytes:
+    """Add what passes for shadow but is body: parts bordered by foreground whose colour is not quite the background's.
+
+    Skin or cloth in nearly the background's colour leaves bites in the outline and holes. A cast shadow touches the
+    body only at the feet; the shadow seen between two legs is enclosed by them but has the floor's very colour.
+    """
+    dim = cv2.bitwise_and(_at_least(changed, threshold), cv2.bitwise_not(mask))
+    count, labels = cv2.connectedComponents(dim, connectivity=4)
+    if count == 1:
+        return mask
+    cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+    beside_mask = cv2.bitwise_and(cv2.dilate(mask, cross), dim) > 0
+    beside_background = cv2.bitwise_and(cv2.dilate(cv2.bitwise_not(cv2.bitwise_or(mask, dim)), cross), dim) > 0
+    inner = np.bincount(labels[beside_mask], minlength=count)
+    outer = np.bincount(labels[beside_background], minlength=count)
+    area = np.bincount(labels.ravel(), minlength=count)
+    colourful = np.bincount(labels.ravel(), weights=colour.ravel(), minlength=count) > CLOTH_COLOUR * weak_colour * area
+    body = (inner > BODY_BORDER * outer) & colourful
+    for rim in (labels[0], labels[-1], labels[:, 0], labels[:, -1]):
+        body[rim] = False
+    body[0] = False
+    return cv2.bitwise_or(mask, np.where(body, np.uint8(255), np.uint8(0))[labels])
+
+
+def _looks_like_cloth(
+    contour: NDArray[np.int32], mask: Bytes, changed: Bytes, colour: Bytes, threshold: int, weak_colour: int
+) -> bool:
+    """Whether more than half of a hole's pixels are changed, and not by a shadow alone."""
+    x, y, w, h = cv2.boundingRect(contour)
+    inside = np.zeros((h, w), dtype=np.uint8)
+    cv2.drawContours(inside, [contour - (x, y)], -1, 255, cv2.FILLED)
+    hole = (inside > 0) & (mask[y : y + h, x : x + w] == 0)
+    if 2 * np.count_nonzero(hole & (changed[y : y + h, x : x + w] >= threshold)) <= np.count_nonzero(hole):
+        return False
+    return bool(colour[y : y + h, x : x + w][hole].mean() > CLOTH_COLOUR * weak_colour)
+
+
+
+def _trim_outline(mask: Bytes, change: Bytes, fraction: float, window: Bytes) -> Bytes:
+    """Drop outline pixels whose change is below `fraction` of the largest one within the window around them.
 
     Blur spreads a person by a pixel or two; the true outline is where the change has half its inner value.
     """
-    inner = cv2.dilate(cv2.bitwise_and(change, mask), _OUTLINE)
-    core = cv2.erode(mask, _OUTLINE)
+    inner = cv2.dilate(cv2.bitwise_and(change, mask), window)
+    core = cv2.erode(mask, window)
     enough = cv2.compare(change, cv2.convertScaleAbs(inner, alpha=fraction), cv2.CMP_GE)
     return cv2.bitwise_and(mask, cv2.bitwise_or(core, enough))

@@ -54,7 +54,7 @@ class BackgroundConfig:
         0.5, "a pixel darker than this fraction of its background is no shadow", low=0.0, high=1.0, live=True
     )
     highlight_brightest: float = setting(
-        1.05, "a pixel brighter than this multiple of its background is no reflected light", low=1.0, high=3.0, live=True
+        1.15, "a pixel brighter than this multiple of its background is no reflected light", low=1.0, high=3.0, live=True
     )
     shadow_sigmas: float = setting(
         2.0,

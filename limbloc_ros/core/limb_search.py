@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from limbloc_ros.core import _anchors_kernels as kernels
 from limbloc_ros.core.anchors import Grid, Limb
-from limbloc_ros.core.figure import BONE, SPHERE, FigureState, Placed, place
+from limbloc_ros.core._figure_kernels import exp_so3
+from limbloc_ros.core.figure import BONE, N_SPHERES, PARENTS, SPHERE, FigureState, Placed, place, proportions
 from limbloc_ros.core.pose import JOINT
 
 Array = NDArray[np.float64]
@@ -117,6 +118,43 @@ def best_pair(grid: Grid, left: list[Limb], right: list[Limb], state: FigureStat
     gain = np.array([x.gain for x in left])[:, None] + np.array([x.gain for x in right])[None] - 1.5 * shared / size
     a, b = np.unravel_index(int(np.argmax(gain)), gain.shape)
     return left[int(a)], right[int(b)]
+
+
+def bend_to(state: FigureState, kind: str, side: str, points: Array) -> FigureState:
+    """Turn the bones of one limb so that its joints come to lie in the direction of `points` [3, 3] m.
+
+    The hinge is perpendicular to the plane of the two bones; where they are almost straight it keeps the turn that
+    the limb has after swinging from hanging the shortest way.
+    """
+    upper, lower, end = ("thigh", "shin", "foot") if kind == "leg" else ("upper_arm", "forearm", "hand")
+    upper, lower, end = (f"{name}_{side}" for name in (upper, lower, end))
+    placed = place(state)
+    parent = placed.rotations[PARENTS[BONE[upper]]]
+    start = placed.joints[JOINT[("hip_" if kind == "leg" else "shoulder_") + side]]
+    first, second, third = _unit(np.diff(np.vstack([start, points]), axis=0))
+    bend = second - (second @ first) * first
+    if kind == "leg":
+        bend = -bend
+    forward = bend + 0.2 * parent @ _forward_of(parent.T @ first)
+    x = _unit(forward - (forward @ first) * first)
+    R_upper = np.stack([x, np.cross(-first, x), -first], axis=1)
+    flexion = np.arctan2(float(second @ x), float(second @ first))  # towards the limb's front
+    hinge = exp_so3(np.array([0.0, -flexion, 0.0]))
+    R_lower = R_upper @ hinge
+    rotations = state.rotations.copy()
+    rotations[BONE[upper]] = parent.T @ R_upper
+    rotations[BONE[lower]] = hinge
+    tip = proportions().point_offsets[N_SPHERES + JOINT[("toe_" if kind == "leg" else "hand_") + side], :, 0]
+    rotations[BONE[end]] = _shortest_turn(_unit(tip), R_lower.T @ third)
+    return FigureState(state.root, rotations, state.shape)
+
+
+def _shortest_turn(a: Array, b: Array) -> Array:
+    """[3, 3] the rotation that takes unit vector a to unit vector b the shortest way."""
+    axis = np.cross(a, b)
+    sine = float(np.linalg.norm(axis))
+    angle = np.arctan2(sine, float(a @ b))
+    return np.asarray(exp_so3(axis / max(sine, 1e-9) * angle))
 
 
 def _bones(placed: Placed, kind: str, side: str) -> _Bones:

@@ -1,0 +1,423 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Numba kernels of the energy: each term adds its cost, gradient and Gauss-Newton matrix.
+
+Every geometric residual depends on one part's (up to) three spheres only, so the terms first add 12 x 12 blocks per
+part (three times x, y, z, radius); `gather` multiplies them by the figure's Jacobian once.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from limbloc_ros.core._figure_kernels import log_so3, part_bounds, part_distance
+
+
+@njit(cache=True, inline="always")  # type: ignore[misc, unused-ignore]
+def robust_weight(d: float, width: float) -> tuple[float, float]:
+    """Geman-McClure: cost width^2 u / (1 + u) with u = (d / width)^2, and the weight of its Gauss-Newton step."""
+    u = (d / width) * (d / width)
+    return width * width * u / (1.0 + u), 1.0 / ((1.0 + u) * (1.0 + u))
+
+
+@njit(cache=True, inline="always")  # type: ignore[misc, unused-ignore]
+def add_block(block: Any, slope: Any, v: Any, residual: float, weight: float) -> None:
+    """Add one residual with derivative v [12] to a part's block (upper triangle) and slope."""
+    for i in range(12):
+        wi = weight * v[i]
+        if wi == 0.0:
+            continue
+        slope[i] += wi * residual
+        for j in range(i, 12):
+            block[i, j] += wi * v[j]
+
+
+@njit(cache=True)  # type: ignore[misc, unused-ignore]
+def surface_term(
+    query: Any,
+    normals: Any,
+    weight_of: Any,
+    parts: Any,
+    spheres: Any,
+    radii: Any,
+    width: float,
+    gate: float,
+    inside_weight: float,
+    blocks: Any,
+    slopes: Any,
+) -> float:
+    """Hull surface points to the nearest part: the figure should explain the whole surface."""
+    bounds = part_bounds(parts, spheres, radii)
+    w = np.empty(3)
+    best_w = np.empty(3)
+    v = np.zeros(12)
+    cost = 0.0
+    for q in range(len(query)):
+        x, y, z = query[q, 0], query[q, 1], query[q, 2]
+        best = 1e9
+        best_part = -1
+        for p in range(len(parts)):
+            bx = x - bounds[p, 0]
+            by = y - bounds[p, 1]
+            bz = z - bounds[p, 2]
+            reach = best + bounds[p, 3]
+            if reach <= 0.0 or bx * bx + by * by + bz * bz > reach * reach:
+                continue
+            d = part_distance(x, y, z, parts[p], spheres, radii, w)
+            if d > 0.0 and d < best and gate > 0.0:
+                # A part whose surface looks the other way is no explanation of this point.
+                nx = x
+                ny = y
+                nz = z
+                length = 0.0
+                for k in range(3):
+                    s = parts[p, k]
+                    nx -= w[k] * spheres[s, 0]
+                    ny -= w[k] * spheres[s, 1]
+                    nz -= w[k] * spheres[s, 2]
+                length = math.sqrt(nx * nx + ny * ny + nz * nz) + 1e-12
+                cosine = (nx * normals[q, 0] + ny * normals[q, 1] + nz * normals[q, 2]) / length
+                d += gate * (1.0 - cosine)
+            if d < best:
+                best = d
+                best_part = p
+                best_w[0] = w[0]
+                best_w[1] = w[1]
+                best_w[2] = w[2]
+        p = best_part
+        nx = x
+        ny = y
+        nz = z
+        r = 0.0
+        for k in range(3):
+            s = parts[p, k]
+            nx -= best_w[k] * spheres[s, 0]
+            ny -= best_w[k] * spheres[s, 1]
+            nz -= best_w[k] * spheres[s, 2]
+            r += best_w[k] * radii[s]
+        length = math.sqrt(nx * nx + ny * ny + nz * nz) + 1e-12
+        d = length - r
+        c, wd = robust_weight(d, width)
+        scale = weight_of[q] * (inside_weight if d < 0.0 else 1.0)
+        cost += scale * c
+        for k in range(3):
+            v[4 * k] = -best_w[k] * nx / length
+            v[4 * k + 1] = -best_w[k] * ny / length
+            v[4 * k + 2] = -best_w[k] * nz / length
+            v[4 * k + 3] = -best_w[k]
+        add_block(blocks[p], slopes[p], v, d, scale * wd)
+    return cost
+
+
+@njit(cache=True, inline="always")  # type: ignore[misc, unused-ignore]
+def sample_sdf(sdf: Any, origin: Any, voxel: float, x: float, y: float, z: float, out: Any) -> float:
+    """Trilinear signed distance (m) with its gradient in `out` [3]; beyond the grid the value at its border."""
+    gx = (x - origin[0]) / voxel
+    gy = (y - origin[1]) / voxel
+    gz = (z - origin[2]) / voxel
+    nx, ny, nz = sdf.shape
+    cx = min(max(gx, 0.0), nx - 1.001)
+    cy = min(max(gy, 0.0), ny - 1.001)
+    cz = min(max(gz, 0.0), nz - 1.001)
+    i = int(cx)
+    j = int(cy)
+    k = int(cz)
+    a = cx - i
+    b = cy - j
+    c = cz - k
+    v000 = sdf[i, j, k]
+    v001 = sdf[i, j, k + 1]
+    v010 = sdf[i, j + 1, k]
+    v011 = sdf[i, j + 1, k + 1]
+    v100 = sdf[i + 1, j, k]
+    v101 = sdf[i + 1, j, k + 1]
+    v110 = sdf[i + 1, j + 1, k]
+    v111 = sdf[i + 1, j + 1, k + 1]
+    v00 = v000 + c * (v001 - v000)
+    v01 = v010 + c * (v011 - v010)
+    v10 = v100 + c * (v101 - v100)
+    v11 = v110 + c * (v111 - v110)
+    v0 = v00 + b * (v01 - v00)
+    v1 = v10 + b * (v11 - v10)
+    out[0] = (v1 - v0) / voxel
+    out[1] = ((1.0 - a) * (v01 - v00) + a * (v11 - v10)) / voxel
+    w0 = (1.0 - a) * (v001 - v000) + a * (v101 - v100)
+    w1 = (1.0 - a) * (v011 - v010) + a * (v111 - v110)
+    out[2] = ((1.0 - b) * w0 + b * w1) / voxel
+    return v0 + a * (v1 - v0)
+
+
+@njit(cache=True)  # type: ignore[misc, unused-ignore]
+def inclusion_term(
+    samples: Any,
+    sample_parts: Any,
+    parts: Any,
+    spheres: Any,
+    radii: Any,
+    sdf: Any,
+    origin: Any,
+    voxel: float,
+    slack: float,
+    width: float,
+    weight: float,
+    blocks: Any,
+    slopes: Any,
+) -> float:
+    """Spheres of the figure that stick out of the hull (constraint 3): one-sided, phi(centre) + radius > slack.
+
+    `samples` [M, 3] are barycentric weights within the parts `sample_parts` [M].
+    """
+    v = np.zeros(12)
+    grad = np.zeros(3)
+    cost = 0.0
+    for m in range(len(samples)):
+        p = sample_parts[m]
+        x = 0.0
+        y = 0.0
+        z = 0.0
+        r = 0.0
+        for k in range(3):
+            s = parts[p, k]
+            x += samples[m, k] * spheres[s, 0]
+            y += samples[m, k] * spheres[s, 1]
+            z += samples[m, k] * spheres[s, 2]
+            r += samples[m, k] * radii[s]
+        e = sample_sdf(sdf, origin, voxel, x, y, z, grad) + r - slack
+        if e <= 0.0:
+            continue
+        c, wd = robust_weight(e, width)
+        cost += weight * c
+        for k in range(3):
+            v[4 * k] = samples[m, k] * grad[0]
+            v[4 * k + 1] = samples[m, k] * grad[1]
+            v[4 * k + 2] = samples[m, k] * grad[2]
+            v[4 * k + 3] = samples[m, k]
+        add_block(blocks[p], slopes[p], v, e, weight * wd)
+    return cost
+
+
+@njit(cache=True)  # type: ignore[misc, unused-ignore]
+def gather(blocks: Any, slopes: Any, parts: Any, J: Any, A: Any, g: Any) -> None:
+    """Multiply the parts' blocks by the figure's Jacobian [S, 4, P] and add them to A [P, P] and g [P]."""
+    n = A.shape[0]
+    JP = np.empty((12, n))
+    B = np.empty((12, 12))
+    for p in range(len(parts)):
+        if blocks[p, 3, 3] == 0.0 and blocks[p, 7, 7] == 0.0 and blocks[p, 11, 11] == 0.0:
+            continue
+        for k in range(3):
+            for i in range(4):
+                JP[4 * k + i] = J[parts[p, k], i]
+        for i in range(12):
+            for j in range(i, 12):
+                B[i, j] = blocks[p, i, j]
+                B[j, i] = blocks[p, i, j]
+        A += JP.T @ (B @ JP)
+        g += JP.T @ slopes[p]
+
+
+@njit(cache=True)  # type: ignore[misc, unused-ignore]
+def penetration_term(
+    pairs: Any,
+    parts: Any,
+    spheres: Any,
+    radii: Any,
+    J: Any,
+    allowed: float,
+    width: float,
+    weight: float,
+    A: Any,
+    g: Any,
+) -> float:
+    """Limb spheres inside parts they do not belong to (constraint 5): `pairs` [M, 2] sphere, part.
+
+    A sphere may sink in by the fraction `allowed` of its radius: flesh gives way, and figures are coarse.
+    """
+    w = np.empty(3)
+    n = A.shape[0]
+    row = np.empty(n)
+    cost = 0.0
+    for m in range(len(pairs)):
+        s = pairs[m, 0]
+        p = pairs[m, 1]
+        x, y, z = spheres[s, 0], spheres[s, 1], spheres[s, 2]
+        a = parts[p, 0]
+        dx = spheres[a, 0] - x
+        dy = spheres[a, 1] - y
+        dz = spheres[a, 2] - z
+        if dx * dx + dy * dy + dz * dz > 0.36:
+            continue
+        d = part_distance(x, y, z, parts[p], spheres, radii, w)
+        e = (1.0 - allowed) * radii[s] - d
+        if e <= 0.0:
+            continue
+        nx = x
+        ny = y
+        nz = z
+        for k in range(3):
+            q = parts[p, k]
+            nx -= w[k] * spheres[q, 0]
+            ny -= w[k] * spheres[q, 1]
+            nz -= w[k] * spheres[q, 2]
+        length = math.sqrt(nx * nx + ny * ny + nz * nz) + 1e-9
+        nx /= length
+        ny /= length
+        nz /= length
+        c, wd = robust_weight(e, width)
+        cost += weight * c
+        for i in range(n):
+            v = (1.0 - allowed) * J[s, 3, i] - nx * J[s, 0, i] - ny * J[s, 1, i] - nz * J[s, 2, i]
+            for k in range(3):
+                if w[k] != 0.0:
+                    q = parts[p, k]
+                    v += w[k] * (nx * J[q, 0, i] + ny * J[q, 1, i] + nz * J[q, 2, i] + J[q, 3, i])
+            row[i] = v
+        for i in range(n):
+            wi = weight * wd * row[i]
+            if wi != 0.0:
+                g[i] += wi * e
+                for j in range(n):
+                    A[i, j] += wi * row[j]
+    return cost
+
+
+@njit(cache=True)  # type: ignore[misc, unused-ignore]
+def posture_term(
+    rotations: Any,
+    shape: Any,
+    dof_bones: Any,
+    dof_axes: Any,
+    rest: Any,
+    low: Any,
+    high: Any,
+    spread: Any,
+    prior_weight: float,
+    limit_weight: float,
+    smooth_pairs: Any,
+    smooth_weight: float,
+    shape_weight: float,
+    log_stature: float,
+    log_stature_std: float,
+    A: Any,
+    g: Any,
+) -> float:
+    """Joint limits (constraint 4), a weak pull to the middle of the range, an even spine, human proportions.
+
+    `rest`, `low`, `high`, `spread` belong to the degrees of freedom; the angle of one is the component of the
+    rotation vector from the bone's rest rotation `rest` [B, 3, 3] along its axis.
+    """
+    cost = 0.0
+    nb = len(rotations)
+    vectors = np.empty((nb, 3))
+    R = np.empty((3, 3))
+    for b in range(1, nb):
+        for i in range(3):
+            for j in range(3):
+                R[i, j] = (
+                    rest[b, 0, i] * rotations[b, 0, j]
+                    + rest[b, 1, i] * rotations[b, 1, j]
+                    + rest[b, 2, i] * rotations[b, 2, j]
+                )
+        vectors[b] = log_so3(R)
+    for d in range(len(dof_bones)):
+        b = dof_bones[d]
+        if b == 0:
+            continue
+        angle = vectors[b, 0] * dof_axes[d, 0] + vectors[b, 1] * dof_axes[d, 1] + vectors[b, 2] * dof_axes[d, 2]
+        e = angle / spread[d]
+        cost += prior_weight * e * e
+        A[3 + d, 3 + d] += prior_weight / (spread[d] * spread[d])
+        g[3 + d] += prior_weight * e / spread[d]
+        over = 0.0
+        if angle > high[d]:
+            over = angle - high[d]
+        elif angle < low[d]:
+            over = angle - low[d]
+        if over != 0.0:
+            cost += limit_weight * over * over
+            A[3 + d, 3 + d] += limit_weight
+            g[3 + d] += limit_weight * over
+    for m in range(len(smooth_pairs)):
+        d1 = smooth_pairs[m, 0]
+        d2 = smooth_pairs[m, 1]
+        a1 = 0.0
+        a2 = 0.0
+        for i in range(3):
+            a1 += vectors[dof_bones[d1], i] * dof_axes[d1, i]
+            a2 += vectors[dof_bones[d2], i] * dof_axes[d2, i]
+        e = a1 - a2
+        cost += smooth_weight * e * e
+        A[3 + d1, 3 + d1] += smooth_weight
+        A[3 + d2, 3 + d2] += smooth_weight
+        A[3 + d1, 3 + d2] -= smooth_weight
+        A[3 + d2, 3 + d1] -= smooth_weight
+        g[3 + d1] += smooth_weight * e
+        g[3 + d2] -= smooth_weight * e
+    first = 3 + len(dof_bones)
+    e = (shape[0] - log_stature) / log_stature_std
+    cost += shape_weight * e * e
+    A[first, first] += shape_weight / (log_stature_std * log_stature_std)
+    g[first] += shape_weight * e / log_stature_std
+    for k in range(1, len(shape)):
+        cost += shape_weight * shape[k] * shape[k]
+        A[first + k, first + k] += shape_weight
+        g[first + k] += shape_weight * shape[k]
+    return cost
+
+
+@njit(cache=True)  # type: ignore[misc, unused-ignore]
+def xor_counts(sdf: Any, origin: Any, voxel: float, parts: Any, spheres: Any, radii: Any) -> tuple[int, int, int]:
+    """Voxels inside the hull only, inside the flesh only (anywhere in the world), and inside the hull (eq. 2)."""
+    bounds = part_bounds(parts, spheres, radii)
+    nx, ny, nz = sdf.shape
+    low = np.zeros(3, np.int64)
+    high = np.array([nx, ny, nz])
+    for p in range(len(parts)):
+        for a in range(3):
+            low[a] = min(low[a], int(math.floor((bounds[p, a] - bounds[p, 3] - origin[a]) / voxel)))
+            high[a] = max(high[a], int(math.ceil((bounds[p, a] + bounds[p, 3] - origin[a]) / voxel)) + 1)
+    filled = np.zeros((high[0] - low[0], high[1] - low[1], high[2] - low[2]), np.uint8)
+    w = np.empty(3)
+    for p in range(len(parts)):
+        lo = np.empty(3, np.int64)
+        hi = np.empty(3, np.int64)
+        for a in range(3):
+            s0 = 1e9
+            s1 = -1e9
+            for k in range(3):
+                s = parts[p, k]
+                s0 = min(s0, spheres[s, a] - radii[s])
+                s1 = max(s1, spheres[s, a] + radii[s])
+            lo[a] = int(math.ceil((s0 - origin[a]) / voxel)) - low[a]
+            hi[a] = int(math.floor((s1 - origin[a]) / voxel)) - low[a]
+        for i in range(lo[0], hi[0] + 1):
+            x = origin[0] + (i + low[0]) * voxel
+            for j in range(lo[1], hi[1] + 1):
+                y = origin[1] + (j + low[1]) * voxel
+                for k in range(lo[2], hi[2] + 1):
+                    if filled[i, j, k] == 0:
+                        z = origin[2] + (k + low[2]) * voxel
+                        if part_distance(x, y, z, parts[p], spheres, radii, w) < 0.0:
+                            filled[i, j, k] = 1
+    hull_only = 0
+    flesh = 0
+    both = 0
+    hull = 0
+    for i in range(filled.shape[0]):
+        for j in range(filled.shape[1]):
+            for k in range(filled.shape[2]):
+                a = i + low[0]
+                b = j + low[1]
+                c = k + low[2]
+                inside = a >= 0 and b >= 0 and c >= 0 and a < nx and b < ny and c < nz and sdf[a, b, c] < 0.0
+                if inside:
+                    hull += 1
+                    if filled[i, j, k]:
+                        both += 1
+                if filled[i, j, k]:
+                    flesh += 1
+    hull_only = hull - both
+    return hull_only, flesh - both, hull

@@ -1,0 +1,255 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The energy of a figure in a hull: eq. 2 of the paper, and the smooth terms that a least-squares fit minimises."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from limbloc_ros.core import _energy_kernels as kernels
+from limbloc_ros.core import _figure_kernels as figure_kernels
+from limbloc_ros.core import figure
+from limbloc_ros.core._figure_topology import PARTS
+from limbloc_ros.core.figure import FigureState
+from limbloc_ros.core.hull import Hull
+from limbloc_ros.core.lm import System
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Weights:
+    """How much each term counts, and the widths (m) within which a residual is believed.
+
+    The surface term is a mean over points, the others are sums, all in square metres.
+    """
+
+    surface: float = 1.0
+    surface_width_m: float = 0.05
+    surface_inside: float = 2.0
+    normal_gate_m: float = 0.03
+    inclusion: float = 0.006
+    inclusion_width_m: float = 0.06
+    inclusion_slack_m: float = 0.002
+    penetration: float = 0.01
+    penetration_allowed: float = 0.5
+    penetration_width_m: float = 0.06
+    posture: float = 2e-7
+    limits: float = 2e-2
+    spine: float = 2e-4
+    proportions: float = 4e-6
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What the fit looks at: points of the hull's surface and the signed distance grid.
+
+    Attributes:
+        points: [Q, 3] on the hull's surface, m, world.
+        normals: [Q, 3] outward.
+        point_weights: [Q], they sum to 1.
+        sdf: float32 [nx, ny, nz], m.
+        origin: [3] centre of sdf[0, 0, 0], m, world.
+        voxel_m: edge length of a voxel, m.
+    """
+
+    points: Array
+    normals: Array
+    point_weights: Array
+    sdf: NDArray[np.float32]
+    origin: Array
+    voxel_m: float
+
+
+def _axis_rotation(axis: int, degrees: float) -> Array:
+    vector = np.zeros(3)
+    vector[axis] = np.radians(degrees)
+    return np.asarray(figure_kernels.exp_so3(vector))
+
+
+# Rest rotations (the middle of each joint's range), then per axis: lowest and highest angle from there, spread; deg.
+# The shoulder's middle is an arm held out to the side and a little forward, so that its range is well inside pi.
+_RANGES: dict[str, dict[str, tuple[float, float, float]]] = {
+    "abdomen": {"x": (-20, 20, 6), "y": (-15, 30, 8), "z": (-20, 20, 7)},
+    "thorax": {"x": (-20, 20, 6), "y": (-15, 30, 8), "z": (-20, 20, 7)},
+    "chest": {"x": (-20, 20, 6), "y": (-15, 30, 8), "z": (-20, 20, 7)},
+    "head": {"x": (-40, 40, 14), "y": (-50, 50, 18), "z": (-70, 70, 25)},
+    "clavicle": {"x": (-25, 25, 8), "z": (-25, 25, 8)},
+    "upper_arm": {"x": (-100, 110, 45), "y": (-110, 90, 45), "z": (-90, 90, 35)},
+    "forearm": {"y": (-150, 3, 60)},
+    "hand": {"x": (-30, 30, 10), "y": (-60, 60, 18), "z": (-90, 90, 40)},
+    "thigh": {"x": (-50, 60, 18), "y": (-100, 60, 40), "z": (-45, 45, 15)},
+    "shin": {"y": (-3, 150, 60)},
+    "foot": {"x": (-25, 25, 10), "y": (-35, 50, 18), "z": (-25, 25, 10)},
+}
+_REST = {
+    "upper_arm_L": _axis_rotation(2, -30) @ _axis_rotation(0, 50),
+    "upper_arm_R": _axis_rotation(2, 30) @ _axis_rotation(0, -50),
+    "thigh_L": _axis_rotation(1, -30),
+    "thigh_R": _axis_rotation(1, -30),
+}
+
+
+def _posture_table() -> tuple[Array, Array, Array, Array]:
+    rest = np.tile(np.eye(3), (figure.N_BONES, 1, 1))
+    low, high, spread = np.full(figure.N_DOF, -np.pi), np.full(figure.N_DOF, np.pi), np.full(figure.N_DOF, 1e3)
+    for name, R in _REST.items():
+        rest[figure.BONE[name]] = R
+    for d in range(figure.N_DOF):
+        bone = figure.BONE_NAMES[figure.DOF_BONES[d]]
+        if bone == "pelvis":
+            continue
+        base, side = (bone[:-2], bone[-1]) if bone[-2:] in ("_L", "_R") else (bone, "L")
+        axis = "xyz"[int(figure.DOF_AXES[d].argmax())]
+        a, b, s = _RANGES[base][axis]
+        if side == "R" and axis in "xz":  # the mirror image of a turn about x or z is the opposite turn
+            a, b = -b, -a
+        low[d], high[d], spread[d] = np.radians([a, b, s])
+    return rest, low, high, spread
+
+
+REST_ROTATIONS, LOW, HIGH, SPREAD = _posture_table()
+
+
+def _dof(bone: str, axis: int) -> int:
+    return next(
+        d for d in range(figure.N_DOF) if figure.DOF_BONES[d] == figure.BONE[bone] and figure.DOF_AXES[d, axis] == 1.0
+    )
+
+
+SPINE_PAIRS = np.array(
+    [(_dof(a, k), _dof(b, k)) for a, b in (("abdomen", "thorax"), ("thorax", "chest")) for k in range(3)], np.int64
+)
+
+
+def _inclusion_samples() -> tuple[Array, NDArray[np.int64]]:
+    """Spheres of the family that each part spans: its corners (once each over all parts) and the middles between."""
+    weights: list[tuple[float, float, float]] = []
+    parts: list[int] = []
+    seen: set[tuple[int, ...]] = set()
+    for p, (a, b, c) in enumerate(figure.PART_SPHERES):
+        corners = ((1.0, 0.0, 0.0), a, a), ((0.0, 1.0, 0.0), b, b), ((0.0, 0.0, 1.0), c, c)
+        middles = ((0.5, 0.5, 0.0), a, b), ((0.0, 0.5, 0.5), b, c), ((0.5, 0.0, 0.5), a, c)
+        for w, i, j in (*corners, *middles):
+            key = (min(i, j), max(i, j))
+            if key in seen or (w[0] == 0.5 and i == j):
+                continue
+            seen.add(key)
+            weights.append(w)
+            parts.append(p)
+    return np.array(weights), np.array(parts, np.int64)
+
+
+INCLUSION_SAMPLES, INCLUSION_PARTS = _inclusion_samples()
+
+
+def _penetration_pairs() -> NDArray[np.int64]:
+    """Limb spheres against the parts of trunk, head and the other limbs."""
+    trunk = {"pelvis", "belly", "abdomen", "thorax", "chest", "head"}
+    arm = ("elbow", "bulge", "wrist", "palm", "knuckles")
+    leg = ("thigh_mid", "knee", "calf", "shin_low", "ankle", "ball")
+    pairs = []
+    for side, other in (("L", "R"), ("R", "L")):
+        for p, (part, _) in enumerate(PARTS):
+            base = part[:-2] if part[-2:] in ("_L", "_R") else part
+            for sphere in arm:
+                if base in trunk or base in ("thigh", "shin") or (part.endswith(other) and base in ("upper_arm", "forearm")):
+                    pairs.append((figure.SPHERE[f"{sphere}_{side}"], p))
+            for sphere in leg:
+                if part.endswith(other) and base in ("thigh", "shin", "foot"):
+                    pairs.append((figure.SPHERE[f"{sphere}_{side}"], p))
+                elif base in ("abdomen", "belly", "thorax", "chest") and sphere in ("knee", "calf"):
+                    pairs.append((figure.SPHERE[f"{sphere}_{side}"], p))
+    return np.array(pairs, np.int64)
+
+
+PENETRATION_PAIRS = _penetration_pairs()
+
+
+def system(state: FigureState, evidence: Evidence, weights: Weights) -> System:
+    """Cost, gradient and Gauss-Newton matrix of the smooth energy at a state.
+
+    Terms: surface (every hull point explained), inclusion (constraint 3), penetration (5), posture (4), proportions
+    (1 and, through shared sizes, 2).
+    """
+    table = figure.proportions()
+    points = (table.point_bones[: figure.N_SPHERES], table.point_offsets[: figure.N_SPHERES], table.point_radii[: figure.N_SPHERES])
+    origins, world, spheres, radii = figure_kernels.forward(
+        state.root, state.rotations, state.shape, figure.PARENTS, table.bone_offsets, *points
+    )
+    J = figure_kernels.jacobian(
+        origins,
+        world,
+        spheres,
+        radii,
+        state.shape,
+        figure.PARENTS,
+        table.bone_offsets,
+        *points,
+        figure.DOF_BONES,
+        figure.DOF_AXES,
+        figure.SUBTREE,
+    )
+    n = J.shape[2]
+    A, g = np.zeros((n, n)), np.zeros(n)
+    blocks, slopes = np.zeros((figure.N_PARTS, 12, 12)), np.zeros((figure.N_PARTS, 12))
+    flesh = (figure.PART_SPHERES, spheres, radii)
+    w = weights
+    cost = kernels.surface_term(
+        evidence.points,
+        evidence.normals,
+        w.surface * evidence.point_weights,
+        *flesh,
+        w.surface_width_m,
+        w.normal_gate_m,
+        w.surface_inside,
+        blocks,
+        slopes,
+    )
+    cost += kernels.inclusion_term(
+        INCLUSION_SAMPLES,
+        INCLUSION_PARTS,
+        *flesh,
+        evidence.sdf,
+        evidence.origin,
+        evidence.voxel_m,
+        w.inclusion_slack_m,
+        w.inclusion_width_m,
+        w.inclusion,
+        blocks,
+        slopes,
+    )
+    kernels.gather(blocks, slopes, figure.PART_SPHERES, J, A, g)
+    cost += kernels.penetration_term(
+        PENETRATION_PAIRS, *flesh, J, w.penetration_allowed, w.penetration_width_m, w.penetration, A, g
+    )
+    cost += kernels.posture_term(
+        state.rotations,
+        state.shape,
+        figure.DOF_BONES,
+        figure.DOF_AXES,
+        REST_ROTATIONS,
+        LOW,
+        HIGH,
+        SPREAD,
+        w.posture,
+        w.limits,
+        SPINE_PAIRS,
+        w.spine,
+        w.proportions,
+        table.log_stature_mean,
+        table.log_stature_std,
+        A,
+        g,
+    )
+    return System(float(cost), g, A)
+
+
+def xor_energy(hull: Hull, placed: figure.Placed) -> float:
+    """Eq. 2: voxels in exactly one of hull and flesh, over voxels of the hull."""
+    hull_only, flesh_only, inside = kernels.xor_counts(
+        hull.sdf, hull.origin_m, hull.voxel_m, figure.PART_SPHERES, placed.spheres, placed.radii
+    )
+    return float((hull_only + flesh_only) / max(inside, 1))

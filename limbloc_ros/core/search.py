@@ -1,0 +1,333 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Hypotheses without any initial pose: where the torso can be, and where limbs can go from it (sections 2.3, 2.4).
+
+The paper looks for knees and elbows on spheres of bone length around hips and shoulders; here that search is
+exhaustive, over the hull's medial axis and uniform directions, for every torso that may be there.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from limbloc_ros.core import _search_kernels as kernels
+from limbloc_ros.core import figure
+from limbloc_ros.core._figure_kernels import exp_so3
+from limbloc_ros.core._figure_topology import SPHERES
+from limbloc_ros.core.figure import BONE, SPHERE, FigureState, Placed
+from limbloc_ros.core.hull import Hull
+
+Array = NDArray[np.float64]
+
+#: Torso spheres that must just fit into the hull, with their weights.
+_SOLID = {
+    "cranium": 1.5, "occiput": 1.5, "neck_low": 1.0, "neck_high": 1.0, "chest": 0.7, "upper_chest": 0.7, "ribs": 1.0,
+    "waist": 1.0, "iliac": 1.0, "hip": 1.0, "shoulder": 1.0,
+}  # fmt: skip
+#: Points (bone, place in units of the stature, radius likewise) that must be empty: above the head, beside the neck.
+_EMPTY = [
+    ("head", (0.02, 0.0, 0.20), 0.02, 1.5),
+    ("head", (0.0, 0.095, 0.06), 0.02, 1.0),
+    ("head", (0.0, -0.095, 0.06), 0.02, 1.0),
+    ("head", (0.12, 0.0, 0.11), 0.01, 0.7),
+    ("head", (-0.09, 0.0, 0.08), 0.01, 0.7),
+]
+_TORSO_BONES = [name for name in figure.BONE_NAMES if not name.startswith(("forearm", "hand", "shin", "foot"))]
+
+
+@dataclass(frozen=True)
+class TorsoTable:
+    """The mean figure's torso in the arrays that the kernels take; lengths in units of the stature."""
+
+    arrays: tuple[Array, Array, Array, Array, Array]
+    weights: Array
+    n_solid: int
+    bends: Array
+    axis_base: Array
+    axis_tip: Array
+
+
+@cache
+def _torso_table() -> TorsoTable:
+    mean = figure.proportions()
+    index = {name: i for i, name in enumerate(_TORSO_BONES)}
+    parents = np.array([-1] + [index[figure.BONE_NAMES[figure.PARENTS[BONE[n]]]] for n in _TORSO_BONES[1:]], np.int64)
+    bones, offsets, radii, weights = [], [], [], []
+    for s, row in enumerate(SPHERES):
+        base = row[0][:-2] if row[0][-2:] in ("_L", "_R") else row[0]
+        if base in _SOLID:
+            bones.append(index[row[1]])
+            offsets.append(mean.point_offsets[s, :, 0])
+            radii.append(mean.point_radii[s, 0])
+            weights.append(_SOLID[base])
+    n_solid = len(bones)
+    for bone, at, radius, weight in _EMPTY:
+        bones.append(index[bone])
+        offsets.append(np.array(at))
+        radii.append(radius)
+        weights.append(weight)
+    bone_offsets = mean.bone_offsets[[BONE[n] for n in _TORSO_BONES]][:, :, :1].copy()
+    arrays = (
+        parents,
+        bone_offsets,
+        np.array(bones, np.int64),
+        np.array(offsets)[:, :, None].copy(),
+        np.array(radii)[:, None].copy(),
+    )
+    bends = np.radians([[0.0, 0.0, 0.0], [0.0, 40.0, 0.0], [0.0, -15.0, 0.0], [25.0, 0.0, 0.0], [-25.0, 0.0, 0.0]])
+    base, tip = [], []
+    core = [SPHERE[n] for n in ("iliac_L", "iliac_R", "hip_L", "hip_R")]
+    skull = [SPHERE[n] for n in ("cranium", "occiput")]
+    for bend in bends:
+        state = FigureState.standing(np.zeros(3), stature=1.0)
+        for bone in ("abdomen", "thorax", "chest"):
+            state.rotations[BONE[bone]] = exp_so3(bend / 3)
+        spheres = figure.place(state).spheres
+        base.append(spheres[core].mean(axis=0))
+        tip.append(spheres[skull].mean(axis=0))
+    return TorsoTable(arrays, np.array(weights), n_solid, bends, np.array(base), np.array(tip))
+
+
+@dataclass(frozen=True)
+class Medial:
+    """The hull's medial axis.
+
+    Attributes:
+        points: [R, 4] x, y, z and depth below the surface, m; in array order.
+    """
+
+    points: Array
+
+    @staticmethod
+    def of(hull: Hull) -> Medial:
+        """Medial voxels at least 0.6 voxels deep."""
+        sdf = hull.sdf
+        return Medial(kernels.medial_ridge(sdf, hull.origin_m, hull.voxel_m, 0.6 * hull.voxel_m, 0.65))
+
+
+def torso_hypotheses(hull: Hull, medial: Medial, rng: np.random.Generator, keep: int = 6) -> list[tuple[FigureState, float]]:
+    """Torsos that fit the hull, the best first, without limbs; each stands for both of its facings.
+
+    Brute force over pairs of medial points (pelvis, skull) x bends x headings, then hill climbing of the best.
+
+    Returns:
+        states with resting limbs and their scores (0 perfect, 1 useless).
+    """
+    table = _torso_table()
+    points = medial.points
+    by_depth = np.argsort(-points[:, 3], kind="stable")
+    trunk = by_depth[points[by_depth, 3] > max(0.04, 0.4 * points[:, 3].max())]
+    pelvis = points[kernels.spread_out(points, trunk, 0.07, 40)]
+    heads = by_depth[(points[by_depth, 3] > 0.045) & (points[by_depth, 3] < 0.16)]
+    skull = points[kernels.spread_out(points, heads, 0.05, 90)]
+    evidence = (hull.sdf, hull.origin_m, hull.voxel_m)
+    found = kernels.torso_from_pairs(
+        pelvis, skull, table.axis_base, table.axis_tip, table.bends, 6, 0.30, 0.95,
+        *evidence, table.arrays, table.weights, table.n_solid, 400,
+    )  # fmt: skip
+    if len(found) == 0:
+        return []
+    found = found[np.argsort(found[:, 13], kind="stable")]
+    spread = np.array([0.02] * 3 + [0.15] * 3 + [0.15] * 3 + [0.15] * 3 + [0.04])
+    climbed = []
+    for start in _distinct(found, 14, 0.10, 0.4):
+        noise = rng.standard_normal((120, 13))
+        climbed.append(
+            kernels.climb_torso(start, noise, *evidence, table.arrays, table.weights, table.n_solid, spread)
+        )
+    ranked = np.array(climbed)
+    ranked = ranked[np.argsort(ranked[:, 13], kind="stable")]
+    return [(_torso_state(pose), float(pose[13])) for pose in _distinct(ranked, keep, 0.08, 0.4)]
+
+
+def _distinct(poses: Array, most: int, apart_m: float, apart_rad: float) -> list[Array]:
+    """The first poses that differ from all before in place, or in axis or heading (modulo half a turn)."""
+    kept: list[tuple[Array, Array]] = []
+    for pose in poses:
+        R = exp_so3(pose[3:6])
+        same = False
+        for other, Q in kept:
+            axis = math.acos(min(1.0, max(-1.0, float(R[:, 2] @ Q[:, 2]))))
+            side = math.acos(min(1.0, abs(float(R[:, 1] @ Q[:, 1]))))
+            if np.linalg.norm(pose[:3] - other[:3]) < apart_m and max(axis, side) < apart_rad:
+                same = True
+                break
+        if not same:
+            kept.append((pose, R))
+            if len(kept) == most:
+                break
+    return [pose for pose, _ in kept]
+
+
+def _torso_state(pose: Array) -> FigureState:
+    state = FigureState.standing(pose[:3], stature=float(np.exp(pose[12])))
+    state.rotations[0] = exp_so3(pose[3:6])
+    for bone in ("abdomen", "thorax", "chest"):
+        state.rotations[BONE[bone]] = exp_so3(pose[6:9] / 3)
+    state.rotations[BONE["head"]] = exp_so3(pose[9:12])
+    return state
+
+
+def turned_about(state: FigureState) -> FigureState:
+    """The same torso looking the other way: half a turn about its long axis, bends and turns mirrored to match."""
+    half = exp_so3(np.array([0.0, 0.0, math.pi]))
+    rotations = state.rotations.copy()
+    placed = figure.place(state)
+    rotations[0] = rotations[0] @ half
+    for bone in ("abdomen", "thorax", "chest", "head"):
+        rotations[BONE[bone]] = half.T @ rotations[BONE[bone]] @ half
+    turned = FigureState(state.root, rotations, state.shape)
+    # keep the volume where it was: the mean figure's axis lies a little before its spine
+    core = [SPHERE[n] for n in ("iliac_L", "iliac_R", "waist_L", "waist_R", "ribs_L", "ribs_R")]
+    shift = placed.spheres[core].mean(axis=0) - figure.place(turned).spheres[core].mean(axis=0)
+    return FigureState(state.root + shift, rotations, state.shape)
+
+
+@cache
+def sphere_directions(count: int) -> Array:
+    """[count, 3] nearly uniform unit vectors (Fibonacci sphere)."""
+    i = np.arange(count) + 0.5
+    z = 1 - 2 * i / count
+    phi = i * math.pi * (3 - math.sqrt(5))
+    r = np.sqrt(1 - z * z)
+    return np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=1)
+
+
+@dataclass(frozen=True)
+class LimbKind:
+    """What the search knows of arms or legs."""
+
+    bones: tuple[str, str, str]
+    spheres: tuple[str, str, str]
+    tip: str
+    skip: float
+    explained_weight: float
+
+
+ARM = LimbKind(("upper_arm", "forearm", "hand"), ("deltoid", "elbow", "wrist"), "tips", 0.3, 1.5)
+LEG = LimbKind(("thigh", "shin", "foot"), ("thigh_top", "knee", "ankle"), "heel", 0.3, 0.5)
+
+_TRUNK_PARTS = np.array(
+    [p for p, name in enumerate(figure.PART_NAMES) if name in ("pelvis", "belly", "abdomen", "thorax", "chest", "head", "neck")]
+)
+
+
+@dataclass(frozen=True)
+class Limbs:
+    """Candidates for one limb: [M, 7] middle joint, end joint (m, world) and score; the best first."""
+
+    base: Array
+    lengths: Array
+    radii: Array
+    tip_m: float
+    found: Array
+
+
+def limb_candidates(
+    hull: Hull, medial: Medial, placed: Placed, kind: LimbKind, side: str, solid_parts: NDArray[np.int64], keep: int
+) -> Limbs:
+    """Where one limb may go from its root joint.
+
+    Args:
+        hull, medial: the volume.
+        placed: the figure whose torso (and legs) are believed.
+        kind: ARM or LEG.
+        side: `L` or `R`.
+        solid_parts: indices of the figure's parts that already explain volume.
+        keep: most candidates.
+    """
+    first, second, third = (BONE[f"{name}_{side}"] for name in kind.bones)
+    base = placed.origins[first]
+    lengths = np.array(
+        [
+            np.linalg.norm(placed.origins[second] - base),
+            np.linalg.norm(placed.origins[third] - placed.origins[second]),
+        ]
+    )
+    radii = placed.radii[[SPHERE[f"{name}_{side}"] for name in kind.spheres]]
+    tip_m = float(np.linalg.norm(placed.spheres[SPHERE[f"{kind.tip}_{side}"]] - placed.origins[third])) * 0.8
+    pelvis = placed.rotations[BONE["pelvis"]]
+    outward = pelvis[:, 1] if side == "L" else -pelvis[:, 1]
+    # thighs do not point up the back or far across the other side
+    no_go = -outward if kind is ARM else (-pelvis[:, 0] + 0.6 * pelvis[:, 2] - 0.4 * outward)
+    forbidden = np.append(no_go / np.linalg.norm(no_go), 0.97 if kind is ARM else 0.6)
+    near = medial.points[
+        ((medial.points[:, :3] - base) ** 2).sum(axis=1) < (1.2 * lengths.sum()) ** 2
+    ]
+    if len(near) > 500:
+        near = near[:: len(near) // 500 + 1]
+    found = kernels.search_limb(
+        base, lengths, radii, tip_m, near, sphere_directions(100), hull.sdf, hull.origin_m, hull.voxel_m,
+        figure.PART_SPHERES[solid_parts], placed.spheres, placed.radii, kind.skip, 0.04 * float(np.exp(0)),
+        kind.explained_weight, forbidden, keep,
+    )  # fmt: skip
+    return Limbs(base, lengths, radii, tip_m, found)
+
+
+def limb_pairs(left: Limbs, right: Limbs, samples: Array, explained: NDArray[np.bool_], trade: float, keep: int) -> list[tuple[int, int, float]]:
+    """Pairs of a left and a right limb that together explain most of the hull.
+
+    Args:
+        left, right: candidates.
+        samples: [Q, 3] points of the hull's surface, m.
+        explained: [Q] which of them the rest of the figure explains already.
+        trade: what a limb's own score costs against a fraction of unexplained samples.
+        keep: how many pairs to return.
+
+    Returns:
+        (index left, index right, cost), the best first.
+    """
+    if len(left.found) == 0 or len(right.found) == 0:
+        return []
+    bits = [
+        np.array([kernels.covered_by_limb(row, limb.base, limb.radii, limb.tip_m, samples, 0.035) for row in limb.found])
+        for limb in (left, right)
+    ]
+    taken = np.zeros(bits[0].shape[1] * 64, np.uint8)
+    taken[: len(samples)] = explained
+    packed = np.packbits(taken, bitorder="little").view(np.uint64)
+    apart = 0.25 * float(left.lengths[0])
+    pairs = kernels.best_pairs(left.found, right.found, *bits, packed, len(samples), trade, apart, keep)
+    return [(int(a), int(b), float(cost)) for a, b, cost in pairs]
+
+
+def with_limb(state: FigureState, placed: Placed, kind: LimbKind, side: str, limb: Array) -> FigureState:
+    """The state with one limb turned so that its joints lie at a candidate's [7] middle and end."""
+    first, second, third = (BONE[f"{name}_{side}"] for name in kind.bones)
+    upper = limb[:3] - placed.origins[first]
+    lower = limb[3:6] - limb[:3]
+    upper, lower = upper / np.linalg.norm(upper), lower / np.linalg.norm(lower)
+    flexion = math.acos(min(1.0, max(-1.0, float(upper @ lower))))
+    parent = placed.rotations[figure.PARENTS[first]]
+    # The hinge: elbows flex about -y, knees about +y. A straight limb gets the y axis of its rest position.
+    if kind is ARM:
+        default = figure_rest(f"upper_arm_{side}", parent)
+        hinge = -np.cross(upper, lower)
+    else:
+        default = parent
+        hinge = np.cross(upper, lower)
+    y = default[:, 1] * max(0.0, 0.35 - math.sin(flexion) if flexion < 1.5 else 0.0) + hinge
+    z = -upper
+    y = y - z * (y @ z)
+    norm = float(np.linalg.norm(y))
+    if norm < 1e-6:
+        y = np.cross(z, parent[:, 0])
+        norm = float(np.linalg.norm(y))
+    y /= norm
+    R = np.stack([np.cross(y, z), y, z], axis=1)
+    rotations = state.rotations.copy()
+    rotations[first] = parent.T @ R
+    rotations[second] = exp_so3(np.array([0.0, -flexion if kind is ARM else flexion, 0.0]))
+    rotations[third] = np.eye(3)
+    return FigureState(state.root, rotations, state.shape)
+
+
+def figure_rest(bone: str, parent: Array) -> Array:
+    """World rotation [3, 3] of a bone at the middle of its range."""
+    from limbloc_ros.core.energy import REST_ROTATIONS
+
+    return np.asarray(parent @ REST_ROTATIONS[BONE[bone]])
