@@ -37,7 +37,7 @@ def recorded(frames=12, lost=(4, 5, 8), jump=10):
         joints = person((0.02 * f + (0.5 if f >= jump else 0.0), 0.0))
         outcome = NoPerson("empty mask") if f in lost else pose_of(joints)
         results.append(FrameResult(int(f * 4e7), outcome, {"carve": 10.0}))
-    return Run(tuple(results), {"input": "a <b>folder</b>", "settings": {"voxel_m": 0.02}, "version": "9.9"})
+    return Run(tuple(results), {"input": "a <b>folder</b>", "config": {"hull": {"voxel_m": 0.02}}, "version": "9.9"})
 
 
 def truth_of(frames=12):
@@ -56,7 +56,7 @@ def test_run_data_keeps_gaps_reasons_times_and_settings():
     assert data.missing_reasons() == [("empty mask", 3)]
     assert np.isnan(data.joints[4]).all()
     np.testing.assert_allclose(data.total_ms[[0, 4]], [50.0, 10.0])  # carving was done, fitting was not
-    assert data.settings == {"settings.voxel_m": "0.02"}
+    assert data.settings == {"hull.voxel_m": "0.02"}
     assert (data.source, data.version) == ("a <b>folder</b>", "9.9")
     assert data.seconds[3] == pytest.approx(0.12)
     assert data.consecutive

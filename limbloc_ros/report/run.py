@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from limbloc_ros import __version__
 from limbloc_ros.core.errors import InputError
-from limbloc_ros.core.pose import JOINT, JOINT_NAMES, STICK_BONES, Array, Pose
-from limbloc_ros.recordings.results import FrameResult, Run
+from limbloc_ros.core.pose import JOINT, JOINT_NAMES, STICK_BONES, Array
+from limbloc_ros.recordings.results import Run
 
 #: The joints that the benchmark scores: the head and the limbs.
 LIMB_JOINTS = (
@@ -105,35 +105,35 @@ class RunData:
             source: what was processed, in words; by default what the run says.
             truth: joint name -> [F, 3] true positions, m; empty or None when not known.
             command: the command line that made the run; by default what the run says.
-            consecutive: whether the frames follow each other; by default judged by how far the head moves.
+            consecutive: whether the frames follow each other; by default what the run says, else judged by how far the
+                head moves.
         """
-        names, angles, joints = run.angle_names, run.angles, run.joints
-        about = flatten(run.about)
-        command = command or about.pop("command", "")
-        source = source or about.pop("input", "")
+        names, angles, joints, about = run.angle_names, run.angles, run.joints, run.about
         known = None
         if truth:
             nothing = np.full((len(run), 3), np.nan)
             known = np.stack([np.asarray(truth.get(name, nothing), dtype=np.float64) for name in JOINT_NAMES], axis=1)
-        stages = list(dict.fromkeys(stage for frame in run.frames for stage in _stage_ms(frame)))
+        stages = list(dict.fromkeys(stage for frame in run.frames for stage in frame.times))
+        if consecutive is None:
+            consecutive = about.get("consecutive")
         if consecutive is None:
             head = steps(joints[:, JOINT["head_centre"]])
             consecutive = not np.isfinite(head).any() or float(np.nanmedian(head)) < UNRELATED_M
         return RunData(
             title=title,
-            source=source,
+            source=source or str(about.get("input", "")),
             joints=joints,
             stamps=run.stamps,
             energy=run.energy,
             sigma=run.sigma,
             reliable=run.reliable,
-            stage_ms={s: np.array([_stage_ms(f).get(s, np.nan) for f in run.frames]) for s in stages},
+            stage_ms={s: np.array([f.times.get(s, np.nan) for f in run.frames]) for s in stages},
             angles={name: angles[:, i] for i, name in enumerate(names)},
             missing={i: reason for i, reason in enumerate(run.reasons) if reason},
             truth=known,
-            settings=about,
-            command=command,
-            version=about.pop("version", __version__),
+            settings=flatten(about.get("config", {})),
+            command=command or str(about.get("command", "")),
+            version=str(about.get("version", __version__)),
             consecutive=consecutive,
         )
 
@@ -212,8 +212,3 @@ def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
         else:
             table[prefix + name] = str(value)
     return table
-
-
-def _stage_ms(frame: FrameResult) -> dict[str, float]:
-    """Times of all stages of a frame, before the pose and within it."""
-    return {**frame.stage_ms, **(frame.outcome.stage_ms if isinstance(frame.outcome, Pose) else {})}
