@@ -7,6 +7,7 @@ from array import array
 from collections.abc import Iterator
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -16,7 +17,7 @@ from ros_graph import Graph
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_srvs.srv import SetBool, Trigger
 
-from limbloc_ros.core.errors import ConfigError
+from limbloc_ros.core.errors import ConfigError, InputError
 from limbloc_ros.nodes.segmentation import SegmentationNode
 from limbloc_ros.nodes.simulated_cameras import SimulatedCamerasNode
 from limbloc_ros.rig.rig_file import load_rig
@@ -82,7 +83,9 @@ def test_segmentation_learns_then_gives_masks_with_the_images_stamps(graph: Grap
     assert overlap > 0.95
     graph.until(diagnostics.says("segmentation: mask", "segmenting"))
     fill = 100 * float((mask > 0).mean())
-    graph.until(lambda: float(diagnostics.value("segmentation: mask", "mask_fill_percent")) == pytest.approx(fill, 0.02))
+    graph.until(
+        lambda: float(diagnostics.value("segmentation: mask", "mask_fill_percent")) == pytest.approx(fill, 0.02)
+    )
 
 
 def test_segmentation_computes_only_the_masks_somebody_wants(graph: Graph) -> None:
@@ -151,6 +154,29 @@ def test_segmentation_survives_bad_images_and_says_so(graph: Graph, kind: str, w
     assert diagnostics["segmentation: mask"].level == DiagnosticStatus.ERROR
     images.publish(good)
     graph.until(lambda: len(masks) == 2)
+
+
+@pytest.mark.parametrize("as_folder", [True, False])
+def test_segmentation_starts_from_a_picture_of_the_empty_room(graph: Graph, tmp_path: Path, as_folder: bool) -> None:
+    room = Room()
+    cv2.imwrite(str(tmp_path / "cam0.png"), room.picture(box=False))
+    picture = tmp_path if as_folder else tmp_path / "cam0.png"
+    graph.add(SegmentationNode, camera="cam0", reliability="reliable", background_picture=str(picture))
+    masks = graph.collect(Image, "cam0/mask")
+    images = graph.publisher(Image, "cam0/image_raw")
+    for n in range(2):  # the first image only gives the noise
+        images.publish(pixels_to_image(room.picture(box=True), header(n)))
+        graph.until(lambda n=n: len(masks) == n + 1)
+    mask = message_to_mask(masks[-1]) > 0
+    assert (mask & room.box).sum() / (mask | room.box).sum() > 0.95
+
+
+def test_segmentation_needs_the_picture_it_was_promised(graph: Graph, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"has no file cam7\.png"):
+        graph.add(SegmentationNode, camera="cam7", background_picture=str(tmp_path))
+    (tmp_path / "cam7.png").write_bytes(b"no picture")
+    with pytest.raises(InputError, match="expected a JPEG or PNG image"):
+        graph.add(SegmentationNode, camera="cam7", background_picture=str(tmp_path))
 
 
 def test_segmentation_says_when_no_camera_is_there(graph: Graph) -> None:

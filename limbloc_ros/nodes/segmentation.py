@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -14,6 +15,9 @@ from std_srvs.srv import SetBool, Trigger
 
 from limbloc_ros.core.background import BackgroundModel, Segmentation, warm_up
 from limbloc_ros.core.config import BackgroundConfig, setting
+from limbloc_ros.core.errors import InputError
+from limbloc_ros.core.images import Pixels
+from limbloc_ros.recordings.videos import pictures_in, read_picture
 from limbloc_ros.ros import image_messages, node_main, topics
 from limbloc_ros.ros.health import Health, Meter
 from limbloc_ros.ros.messages import ERROR, OK, WARN, make_status, stamp_ns
@@ -34,6 +38,9 @@ class SegmentationSettings:
         "of the image subscription; best_effort works with every camera",
         choices=("best_effort", "reliable"),
     )
+    background_picture: str = setting(
+        "", "picture of the empty room, or a folder with one named like the camera; empty: the first images show it"
+    )
     publish: str = setting("on_demand", "masks nobody subscribed to are left out", choices=("on_demand", "always"))
 
 
@@ -45,6 +52,8 @@ class SegmentationNode(Node):
         parameters = NodeParameters(self)
         self.settings = parameters.declare(SegmentationSettings)
         self.model = BackgroundModel(parameters.declare(BackgroundConfig, "background", self._on_config))
+        if self.settings.background_picture:
+            self.model.seed(background_picture(Path(self.settings.background_picture), self.settings.camera))
         warm_up()
         self.last: Segmentation | None = None
         self.meter = Meter()
@@ -112,6 +121,20 @@ class SegmentationNode(Node):
 
     def _on_config(self, config: BackgroundConfig) -> None:
         self.model.config = config
+
+
+def background_picture(path: Path, camera: str) -> Pixels:
+    """The picture of the empty room; `path` is the file, or a folder with a file named like the camera.
+
+    Raises:
+        InputError: there is none, or it cannot be read.
+    """
+    if path.is_dir():
+        found = [file for file in pictures_in(path) if file.stem == camera]
+        if not found:
+            raise InputError(f"parameter background_picture: {path} has no file {camera}.png or {camera}.jpg")
+        path = found[0]
+    return read_picture(path)
 
 
 def main() -> int:
