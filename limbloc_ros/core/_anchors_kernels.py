@@ -136,7 +136,9 @@ def bone_outside(sdf: Grid, a: Array, ends: Array) -> Array:
 
 
 @njit(cache=True)
-def cover_frustum(covered: NDArray[np.bool_], voxels: Array, a: Array, radius_a: float, b: Array, radius_b: float) -> None:
+def cover_frustum(
+    covered: NDArray[np.bool_], voxels: Array, a: Array, radius_a: float, b: Array, radius_b: float
+) -> None:
     """Mark the `voxels` [V, 3] that lie in the frustum with round ends from a to b."""
     dx, dy, dz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
     length2 = dx * dx + dy * dy + dz * dz + 1e-12

@@ -9,7 +9,6 @@ is no longer free for the next one. Each search returns its few best answers, so
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 
@@ -21,14 +20,11 @@ from limbloc_ros.core._figure_kernels import exp_so3
 from limbloc_ros.core.figure import (
     BONE,
     N_SPHERES,
-    PART_NAMES,
-    PART_SPHERES,
     FigureState,
     flesh_distance,
     place,
     proportions,
 )
-from limbloc_ros.core.geodesic import Maxima
 from limbloc_ros.core.hull import Hull
 from limbloc_ros.core.pose import JOINT, Flesh
 from limbloc_ros.core.surface import Surface
@@ -122,14 +118,21 @@ class Grid:
 # --- head -------------------------------------------------------------------------------------------------------------
 
 
-def find_heads(grid: Grid, surface: Surface, patch_curvature: Array, count: int = 3) -> list[Head]:
-    """Spheres of a head's size that the surface wraps on most sides, best first (sections 2.1 and 2.3).
+def find_heads(
+    grid: Grid, surface: Surface, patch_curvature: Array, centre_of_mass: Array, count: int = 2, tried: int = 5
+) -> list[Head]:
+    """Spheres of a head's size that the surface wraps on most sides (sections 2.1 and 2.3).
+
+    Hands, feet and crossed legs wrap spheres too, so an upright torso is hung from each candidate, and the heads whose
+    torso explains most of the hull (eq. 2, locally) are kept.
 
     Args:
         grid: the hull.
         surface: its surface.
         patch_curvature: [N] rad, mean curvature over patches (`curvature_variability`): heads lie in its upper half.
-        count: how many to return at most.
+        centre_of_mass: [3] m.
+        count: how many to return at most, best first; a further one only if it explains at least 85 % as much.
+        tried: how many spheres are tried.
     """
     curved = patch_curvature >= np.median(patch_curvature)
     points, normals = surface.points[curved], surface.normals[curved]
@@ -137,7 +140,9 @@ def find_heads(grid: Grid, surface: Surface, patch_curvature: Array, count: int 
     centres = np.concatenate([points - r * normals for r in HEAD_RADII_M])
     support = np.concatenate(
         [
-            kernels.sphere_support(grid.hull.sdf, grid.local(points - r * normals), r / voxel, _directions(96), 1.1 * voxel)
+            kernels.sphere_support(
+                grid.hull.sdf, grid.local(points - r * normals), r / voxel, _directions(96), 1.1 * voxel
+            )
             for r in HEAD_RADII_M
         ]
     )
@@ -146,16 +151,39 @@ def find_heads(grid: Grid, surface: Surface, patch_curvature: Array, count: int 
     for i in np.argsort(-support, kind="stable"):
         if all(np.linalg.norm(centres[i] - head.centre) > 0.12 for head in found):
             found.append(Head(centres[i], float(radii[i]), float(support[i])))
-            if len(found) == count:
+            if len(found) == tried:
                 break
-    return found
+    explained = np.array(
+        [_torso_scores(grid, head, centre_of_mass, _PLAIN)[0].max() * head.radius**3 for head in found]
+    )
+    order = np.argsort(-explained, kind="stable")
+    return [found[n] for n in order[:count] if explained[n] >= 0.85 * explained[order[0]]]
 
 
 # --- torso ------------------------------------------------------------------------------------------------------------
 
 _NODS, _TILTS = (-0.3, 0.25, 0.8), (-0.45, 0.0, 0.45)
-_BENDS = ((0.0, 0.0), (0.9, 0.0), (-0.4, 0.0), (0.0, 0.6), (0.0, -0.6))  # forward, to the right; rad from pelvis to chest
+_BENDS = (
+    (0.0, 0.0),
+    (0.9, 0.0),
+    (-0.4, 0.0),
+    (0.0, 0.6),
+    (0.0, -0.6),
+)  # forward, to the right; rad from pelvis to chest
 _SCALES = (0.9, 1.0, 1.1)
+
+
+@dataclass(frozen=True)
+class _Choice:
+    """Which torsos are tried: rows of the templates, sizes against the head's, number of headings."""
+
+    postures: tuple[int, ...]
+    scales: tuple[float, ...]
+    headings: int
+
+
+_ALL = _Choice(tuple(range(len(_NODS) * len(_TILTS) * len(_BENDS))), _SCALES, 16)
+_PLAIN = _Choice(tuple(range(len(_TILTS) * len(_BENDS), 2 * len(_TILTS) * len(_BENDS))), (1.0,), 8)  # the middle nod
 
 
 @dataclass(frozen=True)
@@ -183,17 +211,9 @@ def find_torsos(grid: Grid, head: Head, centre_of_mass: Array, count: int = 4) -
     Returns:
         up to `count` different placements, best first, each followed by the same place facing the other way.
     """
-    voxel = grid.hull.voxel_m
     table = _templates()
     stature = head.radius / HEAD_RADIUS
-    axis = head.centre - centre_of_mass
-    turns = _orientations(axis / max(float(np.linalg.norm(axis)), 1e-9))
-    centre = grid.local(head.centre)
-    scores = []
-    for scale in _SCALES:
-        earned = kernels.template_scores(grid.earns, centre, table.samples * (scale * stature / voxel), turns)
-        scores.append(scale**3 * earned / table.samples.shape[1] - table.discomfort[:, None])
-    score = np.stack(scores)  # [scale, template, turn]
+    score, turns = _torso_scores(grid, head, centre_of_mass, _ALL)
     order = np.argsort(-score, axis=None, kind="stable")[:5000]
     s, t, r = np.unravel_index(order, score.shape)
     size = np.asarray(_SCALES)[s] * stature
@@ -209,6 +229,21 @@ def find_torsos(grid: Grid, head: Head, centre_of_mass: Array, count: int = 4) -
             torsos.append(Torso(state, float(score.ravel()[order[n]])))
         free &= ~(same | turned)
     return torsos
+
+
+def _torso_scores(grid: Grid, head: Head, centre_of_mass: Array, choice: _Choice) -> tuple[Array, Array]:
+    """[scale, template, turn] what torsos under a head earn per voxel of their mean size, and the turns [R, 3, 3]."""
+    table = _templates()
+    axis = head.centre - centre_of_mass
+    turns = _orientations(axis / max(float(np.linalg.norm(axis)), 1e-9), choice.headings)
+    centre = grid.local(head.centre)
+    samples = table.samples[list(choice.postures)] * (head.radius / HEAD_RADIUS / grid.hull.voxel_m)
+    cost = table.discomfort[list(choice.postures), None]
+    scores = [
+        scale**3 * kernels.template_scores(grid.earns, centre, samples * scale, turns) / samples.shape[1] - cost
+        for scale in choice.scales
+    ]
+    return np.stack(scores), turns
 
 
 def _hang(head: Head, table: _Templates, posture: int, stature: float, turn: Array) -> FigureState:
@@ -280,7 +315,7 @@ def _directions(count: int) -> Array:
     return np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=1)
 
 
-def _orientations(axis: Array, cone_rad: float = 1.22, headings: int = 16) -> Array:
+def _orientations(axis: Array, headings: int, cone_rad: float = 1.22) -> Array:
     """[R, 3, 3] rotations whose z axis lies within a cone around `axis`, each with evenly spread headings."""
     directions = _directions(400)
     z = directions[directions @ axis > np.cos(cone_rad)]

@@ -15,12 +15,15 @@ from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from limbloc_ros.core import _anchors_kernels as kernels
-from limbloc_ros.core.anchors import Grid, Limb
 from limbloc_ros.core._figure_kernels import exp_so3
+from limbloc_ros.core.anchors import Grid, Limb
 from limbloc_ros.core.figure import BONE, N_SPHERES, PARENTS, SPHERE, FigureState, Placed, place, proportions
+from limbloc_ros.core.geodesic import Maxima
 from limbloc_ros.core.pose import JOINT
+from limbloc_ros.core.surface import Surface
 
 Array = NDArray[np.float64]
 
@@ -57,6 +60,22 @@ class _Bones:
     radii: Array  # [4] at the torso's joint, the middle joint, the next one and the tip
 
 
+def cues_of(grid: Grid, surface: Surface, patch_curvature: Array, maxima: Maxima) -> Cues:
+    """Spread what is known of the surface over the voxels inside: each takes it from the nearest surface voxel."""
+    inside = np.argwhere(grid.hull.sdf < 0)
+    _, row = cKDTree(surface.points).query(grid.world(inside.astype(np.float64)))
+    low, high = np.percentile(patch_curvature, (50, 95))
+    level = np.clip((patch_curvature - low) / max(high - low, 1e-9), 0, 1)
+    gap, _ = cKDTree(surface.points[maxima.rows]).query(surface.points)
+    near = np.exp(-((gap / 0.06) ** 2))
+    out = []
+    for values in (level, near):
+        volume = np.zeros(grid.hull.sdf.shape, dtype=np.float32)
+        volume[tuple(inside.T)] = values[row]
+        out.append(volume)
+    return Cues(*out)
+
+
 def find_limbs(grid: Grid, state: FigureState, kind: str, side: str, cues: Cues) -> list[Limb]:
     """The best legs (`kind` "leg") or arms ("arm") of one side, best first.
 
@@ -83,7 +102,9 @@ def find_limbs(grid: Grid, state: FigureState, kind: str, side: str, cues: Cues)
     limbs: list[Limb] = []
     for m in kept:
         forward = frame @ _forward_of(frame.T @ directions[m])
-        ends, end_score = _on_sphere(grid, middles[m], bones, 1, cues, np.array([*grid.local(start), bones.radii[0] / grid.hull.voxel_m]))
+        ends, end_score = _on_sphere(
+            grid, middles[m], bones, 1, cues, np.array([*grid.local(start), bones.radii[0] / grid.hull.voxel_m])
+        )
         if len(ends) == 0:
             continue
         end_score = end_score - LIMIT * _hinge_limits(directions[m], forward, _unit(ends - middles[m]), kind)
@@ -95,7 +116,9 @@ def find_limbs(grid: Grid, state: FigureState, kind: str, side: str, cues: Cues)
     return limbs[:KEPT_LIMBS]
 
 
-def best_pair(grid: Grid, left: list[Limb], right: list[Limb], state: FigureState, kind: str) -> tuple[Limb, Limb] | None:
+def best_pair(
+    grid: Grid, left: list[Limb], right: list[Limb], state: FigureState, kind: str
+) -> tuple[Limb, Limb] | None:
     """The left and right limb that together explain most of the hull, each voxel counted once."""
     if not left or not right:
         return None

@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The `paper` engine: hull -> pose by the paper's own chain (sections 2.1 to 2.5), each frame alone.
+
+What the paper leaves open is settled in the simplest way that works: where a step has several plausible answers
+(which sphere is the head, which way the torso faces), the few best are carried on as branches, and the energy of the
+posed figure (eq. 2 with constraints 1 to 5) picks the winner.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from limbloc_ros.core import anchors as anchor
+from limbloc_ros.core import limb_search as limbs
+from limbloc_ros.core.anchors import Grid, Head, Limb
+from limbloc_ros.core.figure import N_PARTS, PART_NAMES, FigureState, place
+from limbloc_ros.core.geodesic import Maxima, centre_of_mass, geodesic_map, wide_maxima
+from limbloc_ros.core.hull import Hull
+from limbloc_ros.core.paper_energy import Block, PaperEnergy, PaperTerms, block_of
+from limbloc_ros.core.surface import Surface, curvature_variability, extract_surface
+
+Array = NDArray[np.float64]
+
+_TORSO_ROWS: list[dict[str, float]] = [
+    *({f"root_{axis}": 0.03} for axis in "xyz"),
+    *({f"pelvis_{axis}": 0.12} for axis in "xyz"),
+    *({f"{bone}_{axis}": 0.06 for bone in ("abdomen", "thorax", "chest")} for axis in "xyz"),
+    {"head_x": 0.15},
+    {"head_y": 0.15},
+    {"shape_0": 0.05},
+]
+TORSO = block_of("torso", _TORSO_ROWS)
+SIZES = block_of("sizes", [{"shape_0": 0.04}, *({f"shape_{k}": 0.7} for k in (1, 2, 3, 4))])
+
+
+def _limb_block(kind: str, side: str) -> Block:
+    if kind == "leg":
+        rows = [{f"thigh_{side}_{axis}": 0.15} for axis in "xyz"]
+        rows += [{f"shin_{side}_y": 0.2}, {f"foot_{side}_x": 0.15}, {f"foot_{side}_y": 0.15}]
+    else:
+        rows = [{f"clavicle_{side}_x": 0.12}, {f"clavicle_{side}_z": 0.12}]
+        rows += [{f"upper_arm_{side}_{axis}": 0.2} for axis in "xyz"]
+        rows += [{f"forearm_{side}_y": 0.25}, {f"hand_{side}_x": 0.2}, {f"hand_{side}_y": 0.2}]
+    return block_of(f"{kind}_{side}", rows)
+
+
+LIMBS = {(kind, side): _limb_block(kind, side) for kind in ("leg", "arm") for side in "LR"}
+_PARTS_OF_TORSO = np.array([p for p in range(N_PARTS) if PART_NAMES[p] in anchor.TORSO_PARTS])
+_PARTS_OF_LEGS = np.array([p for p in range(N_PARTS) if PART_NAMES[p][:-2] in ("thigh", "shin", "foot")])
+_WITH_LEGS = np.union1d(_PARTS_OF_TORSO, _PARTS_OF_LEGS)
+
+
+@dataclass(frozen=True)
+class Description:
+    """What section 2.1 computes from a hull: the pictures of figs. 1, 3 and 4.
+
+    Attributes:
+        surface: points, normals, curvature.
+        centre_of_mass: [3] m.
+        geodesic: [N] m, distance over the surface from its point nearest the centre of mass.
+        patch_curvature, variability: [N] rad, mean and standard deviation of the curvature over a head-sized patch.
+        maxima: wide maxima of the geodesic distance.
+    """
+
+    surface: Surface
+    centre_of_mass: Array
+    geodesic: Array
+    patch_curvature: Array
+    variability: Array
+    maxima: Maxima
+
+
+@dataclass(frozen=True)
+class Branch:
+    """One way to read the hull, as far as the fitting sequence has come."""
+
+    head: Head
+    state: FigureState
+    energy: PaperEnergy
+    terms: PaperTerms
+    limbs: dict[str, Limb]
+
+
+def describe(hull: Hull) -> Description:
+    """Surface, curvature and geodesic map of a hull (section 2.1)."""
+    surface = extract_surface(hull)
+    geodesic = geodesic_map(hull, surface)
+    mean, deviation = curvature_variability(surface, 0.08)
+    return Description(surface, centre_of_mass(hull), geodesic, mean, deviation, wide_maxima(surface, geodesic, 0.10))
+
+
+def fit_state(hull: Hull) -> tuple[Branch, Description]:
+    """The fitting sequence: head, torso, legs, arms, then everything at once."""
+    seen = describe(hull)
+    grid = Grid.of(hull)
+    cues = limbs.cues_of(grid, seen.surface, seen.patch_curvature, seen.maxima)
+
+    branches = [
+        branch
+        for head in anchor.find_heads(grid, seen.surface, seen.patch_curvature, seen.centre_of_mass)
+        for branch in _torsos(grid, head, seen)
+    ]
+    branches = [_add_limbs(grid, branch, "leg", cues) for branch in branches]
+    branches = _best(branches, 3)
+    branches = [_add_limbs(grid, branch, "arm", cues) for branch in branches]
+    branches = [_refine(branch, 1) for branch in _best(branches, 2)]
+    return _refine(_best(branches, 1)[0], 2), seen
+
+
+def _torsos(grid: Grid, head: Head, seen: Description) -> list[Branch]:
+    energy = PaperEnergy(grid.hull, head.radius / anchor.HEAD_RADIUS)
+    out = []
+    for torso in anchor.find_torsos(grid, head, seen.centre_of_mass, 2):
+        state, _ = energy.refine(torso.state, TORSO, 160, only=_PARTS_OF_TORSO)
+        out.append(Branch(head, state, energy, energy.terms(state, _PARTS_OF_TORSO), {}))
+    return out
+
+
+def _add_limbs(grid: Grid, branch: Branch, kind: str, cues: limbs.Cues) -> Branch:
+    """Find both legs or both arms in what torso (and legs) leave of the hull."""
+    present = _PARTS_OF_TORSO if kind == "leg" else _WITH_LEGS
+    flesh = place(branch.state).flesh()
+    names = tuple(PART_NAMES[p] for p in present)
+    free = grid.without(anchor.part_of(flesh, names), limbs.PRICE)
+    found = {side: limbs.find_limbs(free, branch.state, kind, side, cues) for side in "LR"}
+    pair = limbs.best_pair(free, found["L"], found["R"], branch.state, kind)
+    state, points = branch.state, dict(branch.limbs)
+    for side, limb in zip("LR", pair or (), strict=False):
+        state = limbs.bend_to(state, kind, side, limb.points)
+        points[f"{kind}_{side}"] = limb
+    terms = branch.energy.terms(state, _WITH_LEGS if kind == "leg" else None)
+    return replace(branch, state=state, terms=terms, limbs=points)
+
+
+def _refine(branch: Branch, rounds: int) -> Branch:
+    """Block by block from the trunk to the leaves (section 2.3), then sizes."""
+    state = branch.state
+    for _ in range(rounds):
+        for block, budget in ((TORSO, 150), *((block, 120) for block in LIMBS.values()), (SIZES, 60)):
+            state, _result = branch.energy.refine(state, block, budget)
+    return replace(branch, state=state, terms=branch.energy.terms(state))
+
+
+def _best(branches: list[Branch], count: int) -> list[Branch]:
+    return sorted(branches, key=lambda branch: branch.terms.total)[:count]
