@@ -96,7 +96,8 @@ def fix(
     """Write one row of the model (all [W]) in the fixed point that `measure` reads; arguments as in `learn`."""
     top = np.float32(65535)
     for x in range(mean.size):
-        level[x] = np.uint16(np.int32(min(max(mean[x], np.float32(0)) * np.float32(LEVEL_SCALE) + np.float32(0.5), top)))
+        units = max(mean[x], np.float32(0)) * np.float32(LEVEL_SCALE)
+        level[x] = np.uint16(np.int32(min(units + np.float32(0.5), top)))
     for x in range(mean.size):
         sharp = np.float32(SHARPNESS_SCALE) * np.sqrt(weight / (variance[x] + floor_variance))
         sharpness[x] = np.uint16(np.int32(min(sharp + np.float32(0.5), top)))
@@ -161,7 +162,7 @@ def learn(
 
 
 @njit(cache=True)
-def light_gain(image: Bytes, mean: Floats, busy: Bytes, last: Floats, stride: int) -> Floats:
+def light_gain(image: Bytes, level: Words, busy: Bytes, last: Floats, stride: int) -> Floats:
     """Brightness of the light per channel relative to the model: a median ratio, then a trimmed ratio of sums.
 
     Looks at every `stride`-th pixel that is not `busy` and whose background is neither dark nor near clipping.
@@ -177,7 +178,7 @@ def light_gain(image: Bytes, mean: Floats, busy: Bytes, last: Floats, stride: in
         total = 0
         for y in range(stride // 2, height, stride):
             for x in range(stride // 2, width, stride):
-                m = mean[c, y, x]
+                m = np.float32(level[c, y, x]) * np.float32(1.0 / LEVEL_SCALE)
                 v = image[c, y, x]
                 if busy[y, x] == 0 and m > 20.0 and v < 250:
                     counts[min(int(np.float32(v) / m * np.float32(256.0)), bins - 1)] += 1
@@ -194,7 +195,7 @@ def light_gain(image: Bytes, mean: Floats, busy: Bytes, last: Floats, stride: in
         bottom = 0.0
         for y in range(stride // 2, height, stride):
             for x in range(stride // 2, width, stride):
-                m = mean[c, y, x]
+                m = np.float32(level[c, y, x]) * np.float32(1.0 / LEVEL_SCALE)
                 v = image[c, y, x]
                 if busy[y, x] == 0 and m > 20.0 and v < 250 and abs(v - centre * m) <= 0.08 * centre * m + 2.0:
                     top += v
@@ -242,6 +243,62 @@ def grow_from_seeds(weak: Bytes, strong: Bytes) -> Bytes:
                             depth += 1
         start += 1
     return out
+
+
+@njit(cache=True)
+def add_body_parts(
+    mask: Bytes, changed: Bytes, colour: Bytes, threshold: int, least_colour: float, border_ratio: float
+) -> None:
+    """Add to `mask`, in place, the 4-connected changed parts outside it that are more body than shadow.
+
+    A part is body when its border pixels beside `mask` are more than `border_ratio` times those beside unchanged
+    background, its mean `colour` is above `least_colour`, and it does not touch the rim of the arrays.
+
+    Args:
+        mask: [H, W] 0 or 255.
+        changed, colour: [H, W] evidence; a pixel is changed at `threshold`.
+    """
+    height, width = mask.shape
+    seen = np.zeros((height, width), dtype=np.uint8)
+    part = np.empty(height * width, dtype=np.int32)
+    for y0 in range(height):
+        for x0 in range(width):
+            if changed[y0, x0] < threshold or mask[y0, x0] != 0 or seen[y0, x0] != 0:
+                continue
+            part[0] = y0 * width + x0
+            seen[y0, x0] = 1
+            size = 1
+            done = 0
+            inner = 0
+            outer = 0
+            total = 0
+            at_rim = False
+            while done < size:
+                y, x = part[done] // width, part[done] % width
+                done += 1
+                total += colour[y, x]
+                if y == 0 or x == 0 or y == height - 1 or x == width - 1:
+                    at_rim = True
+                beside_mask = False
+                beside_background = False
+                for k in range(4):
+                    yy = y + (k == 0) - (k == 1)
+                    xx = x + (k == 2) - (k == 3)
+                    if yy < 0 or xx < 0 or yy >= height or xx >= width:
+                        continue
+                    if mask[yy, xx] == 255:
+                        beside_mask = True
+                    elif changed[yy, xx] < threshold:
+                        beside_background = True
+                    elif seen[yy, xx] == 0:
+                        seen[yy, xx] = 1
+                        part[size] = yy * width + xx
+                        size += 1
+                inner += beside_mask
+                outer += beside_background
+            if not at_rim and inner > border_ratio * outer and total > least_colour * size:
+                for k in range(size):
+                    mask[part[k] // width, part[k] % width] = 255
 
 
 @njit(cache=True)

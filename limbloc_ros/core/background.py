@@ -7,8 +7,7 @@ nothing. Around this core, because real rooms need it:
 * the light's slow drift is one gain per channel and frame, taken from the background itself;
 * a shadow darkens a pixel and leaves its colour, so only what a factor `shadow_darkest .. highlight_brightest` on the
   background cannot explain counts as foreground (Horprasert et al. 1999);
-* hysteresis: a weakly changed pixel counts when it hangs together with a strongly changed one;
-* the outline is put where the change falls to half of its value just inside, which undoes the blur of lens and codec;
+* the evidence is cleaned into a mask by hysteresis, morphology and trimming (`mask_cleaning`);
 * when most of the image changes at once, the light was switched: no mask, and the background is learned anew.
 
 A mask depends on the images given before and on nothing else.
@@ -17,8 +16,10 @@ A mask depends on the images given before and on nothing else.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -26,40 +27,27 @@ from numpy.typing import NDArray
 
 from limbloc_ros.core._background_kernels import (
     CHANGE_SCALE,
-    COLOUR_SCALE,
+    LEVEL_SCALE,
     densest_mean,
     fix_all,
-    grow_from_seeds,
     learn,
     light_gain,
     measure,
 )
 from limbloc_ros.core.config import BackgroundConfig, validated
 from limbloc_ros.core.errors import InputError
+from limbloc_ros.core.mask_cleaning import clean_mask
 
 Bytes = NDArray[np.uint8]
 Floats = NDArray[np.float32]
-
-REFERENCE_PIXELS = 640 * 480
-"""Sizes in the configuration are meant for images of this many pixels."""
 
 PATIENCE = 3
 """Frames in a row that must disagree with the whole background before it is learned anew (a flash is shorter)."""
 
 LEARNED_ROWS = 8
-"""Every row of pixels learns from every eighth image, with a rate to match: nearly the same background for less time."""
+"""Every row of pixels learns from every eighth image, with a rate to match: the same background in less time."""
 
-BODY_BORDER = 0.7
-"""A part that looks like shadow is body when its border runs along foreground this much of the way along background."""
-
-CLOTH_COLOUR = 0.6
-"""... and when its colour differs from the background's by more than this part of `shadow_sigmas` on average."""
-
-HALO_FRACTION = 0.3
-"""The halo around a person has less than this part of the change at the outline."""
-
-_OUTLINE = np.ones((5, 5), dtype=np.uint8)
-_HALO = np.ones((13, 13), dtype=np.uint8)
+_RIM = np.ones((5, 5), dtype=np.uint8)
 _GRADIENT_BINS = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, float("inf"))
 
 
@@ -219,17 +207,16 @@ class BackgroundModel:
             if self._learned >= self._config.learning_frames:
                 self._finish_learning()
             return self._no_mask(light_jump=False)
-        self._gain = light_gain(planes, self._mean, self._busy, self._gain, self._stride())
+        self._gain = light_gain(planes, self._level, self._busy, self._gain, self._stride())
         if not self._noise_known:
             self._estimate_noise(planes)
         change, colour = self._measure(planes)
-        threshold = int(round(self._config.threshold_sigmas * CHANGE_SCALE))
-        changed = cv2.medianBlur(change, 3)
-        if np.count_nonzero(changed >= threshold) > self._config.relearn_fraction * changed.size:
+        threshold = round(self._config.threshold_sigmas * CHANGE_SCALE)
+        if np.count_nonzero(change >= threshold) > self._config.relearn_fraction * change.size:
             return self._light_jumped(planes)
         self._upset = 0
-        mask = self._clean(change, changed, colour, threshold)
-        self._busy = cv2.dilate(mask, _OUTLINE)
+        mask = clean_mask(change, colour, self._config)
+        self._busy = cv2.dilate(mask, _RIM)
         if not self._frozen and self._config.learning_rate > 0:
             self._follow(planes, change, threshold)
         fraction = cv2.countNonZero(mask) / mask.size
@@ -273,7 +260,7 @@ class BackgroundModel:
         if mask.shape == (height, width):
             return mask
         smooth = cv2.resize(mask, (width, height), interpolation=cv2.INTER_LINEAR)
-        return cv2.threshold(smooth, 127, 255, cv2.THRESH_BINARY)[1]
+        return np.asarray(cv2.threshold(smooth, 127, 255, cv2.THRESH_BINARY)[1], dtype=np.uint8)
 
     def _stride(self) -> int:
         """Sampling of the gain: about 3000 pixels whatever the image's size."""
@@ -298,7 +285,7 @@ class BackgroundModel:
         if self._learned == 0:
             self._allocate(planes)
             return
-        gain = light_gain(planes, self._mean, self._busy, np.ones(3, dtype=np.float32), self._stride())
+        gain = light_gain(planes, _fixed(self._mean), self._busy, np.ones(3, dtype=np.float32), self._stride())
         self._learned += 1
         now = planes.astype(np.float32) / gain[:, None, None]
         before = now - self._mean
@@ -324,7 +311,7 @@ class BackgroundModel:
         slope = np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0, scale=0.125), cv2.Sobel(grey, cv2.CV_32F, 0, 1, scale=0.125))
         slope = cv2.dilate(slope, np.ones((3, 3), dtype=np.uint8))
         off = np.abs(planes.astype(np.float32) - self._mean * self._gain[:, None, None])
-        for low, high in zip(_GRADIENT_BINS[:-1], _GRADIENT_BINS[1:], strict=True):
+        for low, high in itertools.pairwise(_GRADIENT_BINS):
             where = (slope >= low) & (slope < high)
             if np.count_nonzero(where) < 100:
                 where = slope >= low if low > 0 else np.ones_like(where)
@@ -393,49 +380,6 @@ class BackgroundModel:
                 self._finish_learning()
         return self._no_mask(light_jump=True)
 
-    def _clean(self, change: Bytes, changed: Bytes, colour: Bytes, threshold: int) -> Bytes:
-        """Distances of every pixel -> mask at working size.
-
-        Args:
-            change, changed: distance to the background, as measured and median filtered, in sigmas * CHANGE_SCALE.
-            colour: the part that no shadow explains, in sigmas * COLOUR_SCALE.
-            threshold: of `changed`.
-        """
-        config = self._config
-        scale = np.sqrt(change.size / REFERENCE_PIXELS)
-        blob, hole = config.min_blob_px * scale**2, config.max_hole_px * scale**2
-        colour = cv2.medianBlur(colour, 3)
-        weak_colour = int(round(config.shadow_sigmas * COLOUR_SCALE))
-        weak = cv2.bitwise_and(_at_least(changed, threshold), _at_least(colour, weak_colour))
-        strong = cv2.bitwise_and(weak, _at_least(colour, min(2 * weak_colour, 255)))
-        weak[[0, -1], :] = 0
-        weak[:, [0, -1]] = 0
-        full = grow_from_seeds(weak, strong)
-        x, y, w, h = cv2.boundingRect(full)
-        if w == 0:
-            return full
-        pad = 8 + int(2 * config.close_px * scale)
-        rows = slice(max(y - pad, 0), y + h + pad)
-        columns = slice(max(x - pad, 0), x + w + pad)
-        mask = np.ascontiguousarray(full[rows, columns])
-        change, changed = np.ascontiguousarray(change[rows, columns]), changed[rows, columns]
-        colour = colour[rows, columns]
-        mask = _morph(mask, cv2.MORPH_OPEN, config.open_px * scale)
-        mask = _morph(mask, cv2.MORPH_CLOSE, config.close_px * scale)
-        mask = _fill_bites(mask, changed, colour, threshold, weak_colour)
-        _tidy(mask, changed, colour, threshold, weak_colour, blob, hole)
-        if config.edge_fraction > 0:
-            # First the wide faint halo that video codecs draw around things, then the blur of the outline itself.
-            mask = _trim_outline(mask, change, HALO_FRACTION * config.edge_fraction, _HALO)
-            mask = _trim_outline(mask, change, config.edge_fraction, _OUTLINE)
-            mask = _morph(mask, cv2.MORPH_CLOSE, 1.0)
-            _tidy(mask, changed, colour, threshold, weak_colour, blob, hole)
-        full[rows, columns] = mask
-        # The outermost pixels cannot be judged by their neighbours: they follow the next ones.
-        full[0], full[-1] = full[1], full[-2]
-        full[:, 0], full[:, -1] = full[:, 1], full[:, -2]
-        return full
-
 
 def estimate_background(frames: Iterable[Bytes], share: float = 0.4) -> BackgroundEstimate:
     """Guess the empty room from frames in which a person is always somewhere.
@@ -462,14 +406,17 @@ def estimate_background(frames: Iterable[Bytes], share: float = 0.4) -> Backgrou
         raise InputError(f"expected frames of one size, got {sorted(shapes)}; each camera needs its own background")
     samples = np.stack(stack)
     spread = samples[np.linspace(0, len(samples) - 1, min(len(samples), 9)).round().astype(int)]
-    middle = np.ascontiguousarray(np.median(spread, axis=0).astype(np.float32).transpose(2, 0, 1))
+    middle = np.ascontiguousarray(_fixed(np.median(spread, axis=0)).transpose(2, 0, 1))
     nobody = np.zeros(middle.shape[1:], dtype=np.uint8)
     ones = np.ones(3, dtype=np.float32)
-    gains = np.stack(
-        [light_gain(np.ascontiguousarray(f.transpose(2, 0, 1)), middle, nobody, ones, 4) for f in samples]
-    )
+    gains = np.stack([light_gain(np.ascontiguousarray(f.transpose(2, 0, 1)), middle, nobody, ones, 4) for f in samples])
     mean, sigma = densest_mean(samples, gains, share)
     return BackgroundEstimate(mean, sigma)
+
+
+def _fixed(grey_levels: NDArray[np.floating[Any]]) -> NDArray[np.uint16]:
+    """Means in the kernels' fixed point."""
+    return np.rint(grey_levels * LEVEL_SCALE).astype(np.uint16)
 
 
 def warm_up() -> None:
@@ -480,91 +427,3 @@ def warm_up() -> None:
     for _ in range(3):
         model.segment(image)
     estimate_background([image] * 3)
-
-
-def _at_least(levels: Bytes, threshold: int) -> Bytes:
-    """255 where `levels` >= threshold."""
-    return cv2.threshold(levels, max(threshold - 1, 0), 255, cv2.THRESH_BINARY)[1]
-
-
-def _morph(mask: Bytes, operation: int, radius: float) -> Bytes:
-    size = 2 * int(round(radius)) + 1
-    if size == 1:
-        return mask
-    return cv2.morphologyEx(mask, operation, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)))
-
-
-def _tidy(
-    mask: Bytes, changed: Bytes, colour: Bytes, threshold: int, weak_colour: int, blob: float, hole: float
-) -> None:
-    """In place: erase blobs of less than `blob` px, fill holes of less than `hole` px or that are no real holes.
-
-    A true hole, seen between arm and trunk, shows the background itself. A hole that is mostly changed and merely has
-    nearly the background's colour under less light is cloth.
-    """
-    contours, hierarchy = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
-    if hierarchy is None:
-        return
-    erase, fill = [], []
-    for contour, links in zip(contours, hierarchy[0], strict=True):
-        # Pick's theorem: the polygon through the pixel centres misses half of its own pixels, less one. A hole's
-        # outline runs on the foreground around it.
-        area, rim = cv2.contourArea(contour), len(contour) / 2
-        if links[3] < 0:
-            if area + rim + 1 < blob:
-                erase.append(contour)
-        elif area - rim + 1 < hole or _looks_like_cloth(contour, mask, changed, colour, threshold, weak_colour):
-            fill.append(contour)
-    if fill:
-        cv2.drawContours(mask, fill, -1, 255, cv2.FILLED)
-    if erase:
-        cv2.drawContours(mask, erase, -1, 0, cv2.FILLED)
-
-
-def _fill_bites(mask: Bytes, changed: Bytes, colour: Bytes, threshold: int, weak_colour: int) -> Bytes:
-    """Add what passes for shadow but is body: parts bordered by foreground whose colour is not quite the background's.
-
-    Skin or cloth in nearly the background's colour leaves bites in the outline and holes. A cast shadow touches the
-    body only at the feet; the shadow seen between two legs is enclosed by them but has the floor's very colour.
-    """
-    dim = cv2.bitwise_and(_at_least(changed, threshold), cv2.bitwise_not(mask))
-    count, labels = cv2.connectedComponents(dim, connectivity=4)
-    if count == 1:
-        return mask
-    cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
-    beside_mask = cv2.bitwise_and(cv2.dilate(mask, cross), dim) > 0
-    beside_background = cv2.bitwise_and(cv2.dilate(cv2.bitwise_not(cv2.bitwise_or(mask, dim)), cross), dim) > 0
-    inner = np.bincount(labels[beside_mask], minlength=count)
-    outer = np.bincount(labels[beside_background], minlength=count)
-    area = np.bincount(labels.ravel(), minlength=count)
-    colourful = np.bincount(labels.ravel(), weights=colour.ravel(), minlength=count) > CLOTH_COLOUR * weak_colour * area
-    body = (inner > BODY_BORDER * outer) & colourful
-    for rim in (labels[0], labels[-1], labels[:, 0], labels[:, -1]):
-        body[rim] = False
-    body[0] = False
-    return cv2.bitwise_or(mask, np.where(body, np.uint8(255), np.uint8(0))[labels])
-
-
-def _looks_like_cloth(
-    contour: NDArray[np.int32], mask: Bytes, changed: Bytes, colour: Bytes, threshold: int, weak_colour: int
-) -> bool:
-    """Whether more than half of a hole's pixels are changed, and not by a shadow alone."""
-    x, y, w, h = cv2.boundingRect(contour)
-    inside = np.zeros((h, w), dtype=np.uint8)
-    cv2.drawContours(inside, [contour - (x, y)], -1, 255, cv2.FILLED)
-    hole = (inside > 0) & (mask[y : y + h, x : x + w] == 0)
-    if 2 * np.count_nonzero(hole & (changed[y : y + h, x : x + w] >= threshold)) <= np.count_nonzero(hole):
-        return False
-    return bool(colour[y : y + h, x : x + w][hole].mean() > CLOTH_COLOUR * weak_colour)
-
-
-
-def _trim_outline(mask: Bytes, change: Bytes, fraction: float, window: Bytes) -> Bytes:
-    """Drop outline pixels whose change is below `fraction` of the largest one within the window around them.
-
-    Blur spreads a person by a pixel or two; the true outline is where the change has half its inner value.
-    """
-    inner = cv2.dilate(cv2.bitwise_and(change, mask), window)
-    core = cv2.erode(mask, window)
-    enough = cv2.compare(change, cv2.convertScaleAbs(inner, alpha=fraction), cv2.CMP_GE)
-    return cv2.bitwise_and(mask, cv2.bitwise_or(core, enough))

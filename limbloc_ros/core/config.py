@@ -54,7 +54,11 @@ class BackgroundConfig:
         0.5, "a pixel darker than this fraction of its background is no shadow", low=0.0, high=1.0, live=True
     )
     highlight_brightest: float = setting(
-        1.15, "a pixel brighter than this multiple of its background is no reflected light", low=1.0, high=3.0, live=True
+        1.15,
+        "a pixel brighter than this multiple of its background is no reflected light",
+        low=1.0,
+        high=3.0,
+        live=True,
     )
     shadow_sigmas: float = setting(
         2.0,
@@ -92,7 +96,11 @@ class BackgroundConfig:
         live=True,
     )
     max_pixels: int = setting(
-        700_000, "larger images are halved until they have no more pixels than this", unit="px", low=10_000, high=100_000_000
+        700_000,
+        "larger images are halved until they have no more pixels than this",
+        unit="px",
+        low=10_000,
+        high=100_000_000,
     )
 
 
