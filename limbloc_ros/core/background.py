@@ -187,6 +187,7 @@ class BackgroundModel:
             self._mean[c], self._variance[c] = planes_c
         self._learned = 1
         self._ready = True
+        self._fix_model()
 
     def segment(self, image: Bytes) -> Segmentation:
         """Segment the next image of this camera.
@@ -416,7 +417,7 @@ def estimate_background(frames: Iterable[Bytes], share: float = 0.4) -> Backgrou
 
 def _fixed(grey_levels: NDArray[np.floating[Any]]) -> NDArray[np.uint16]:
     """Means in the kernels' fixed point."""
-    return np.rint(grey_levels * LEVEL_SCALE).astype(np.uint16)
+    return np.asarray(np.rint(grey_levels * LEVEL_SCALE), dtype=np.uint16)
 
 
 def warm_up() -> None:

@@ -53,19 +53,21 @@ class BagFrame:
         return image_to_pixels(msg) if self.stream.type == IMAGE else compressed_to_pixels(msg)
 
 
-def camera_streams(bag: BagReader, cameras: Sequence[str]) -> dict[str, CameraStream]:
-    """The topic of every camera: masks if the bag has any, else images; in any namespace.
+def camera_streams(bag: BagReader, cameras: Sequence[str], prefer: str = "masks") -> dict[str, CameraStream]:
+    """The topic of every camera, in any namespace.
 
     Args:
         bag: an open recording.
         cameras: the names in the rig file.
+        prefer: `masks` or `images`: what to take when the bag has both.
 
     Raises:
         InputError: a camera without topic (the bag's camera topics are listed), or several namespaces with the same
             camera.
     """
     masks, images = (_find(bag, cameras, endings) for endings in (MASK_ENDINGS, IMAGE_ENDINGS))
-    found, is_mask = (masks, True) if masks else (images, False)
+    is_mask = bool(masks) and (prefer == "masks" or not images)
+    found = masks if is_mask else images
     if missing := [name for name in cameras if name not in found]:
         known = {**MASK_ENDINGS, **IMAGE_ENDINGS}
         others = sorted(t.name for t in bag.topics.values() if t.type in known.values())

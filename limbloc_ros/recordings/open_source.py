@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,10 +15,9 @@ from limbloc_ros.recordings.cases import is_case, load_case
 from limbloc_ros.recordings.folder_source import ESTIMATE, FolderSource
 from limbloc_ros.recordings.offline import OfflineConfig
 from limbloc_ros.recordings.sources import BagSource, CaseSource, Source, check_size
+from limbloc_ros.recordings.videos import pictures_in, read_picture
 
 Pixels = NDArray[np.uint8]
-
-PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 
 
 def open_source(
@@ -84,7 +82,7 @@ def background_pictures(folder: Path, rig: Rig) -> dict[str, Pixels]:
     """
     if not folder.is_dir():
         raise InputError(f"--background {folder}: expected a folder with a picture per camera, or the word {ESTIMATE}")
-    found = {p.stem: p for p in sorted(folder.iterdir()) if p.suffix.lower() in PICTURE_SUFFIXES}
+    found = {picture.stem: picture for picture in pictures_in(folder)}
     missing = [name for name in rig.names if name not in found]
     if missing:
         raise InputError(
@@ -93,10 +91,7 @@ def background_pictures(folder: Path, rig: Rig) -> dict[str, Pixels]:
         )
     pictures = {}
     for name in rig.names:
-        picture = cv2.imread(str(found[name]), cv2.IMREAD_COLOR)
-        if picture is None:
-            raise InputError(f"{found[name]} cannot be read as a picture; save it again as PNG")
-        pictures[name] = np.asarray(picture, dtype=np.uint8)
+        pictures[name] = read_picture(found[name])
         check_size(pictures[name], rig, name, str(found[name]))
     return pictures
 

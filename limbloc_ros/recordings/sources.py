@@ -158,15 +158,18 @@ class Segmenter:
         rig: the cameras.
         config: the same for all.
         pictures: camera name -> picture of the empty room; cameras without one learn from their first frames.
+
+    Attributes:
+        models: camera name -> its background model.
     """
 
     def __init__(self, rig: Rig, config: BackgroundConfig, pictures: Mapping[str, Pixels]) -> None:
         self._rig = rig
-        self._models = {name: BackgroundModel(config) for name in rig.names}
+        self.models = {name: BackgroundModel(config) for name in rig.names}
         self._config = config
         for name, picture in pictures.items():
             check_size(picture, rig, name, "its background picture")
-            self._models[name].seed(picture)
+            self.models[name].seed(picture)
 
     def masks(self, images: Mapping[str, Pixels]) -> tuple[dict[str, Pixels], str]:
         """Segment the next image of each camera.
@@ -177,7 +180,7 @@ class Segmenter:
         results = {}
         for name, image in images.items():
             check_size(image, self._rig, name, "its image")
-            results[name] = self._models[name].segment(image)
+            results[name] = self.models[name].segment(image)
         reason = ""
         if all(result.learning for result in results.values()):
             learned = min(result.frames_learned for result in results.values())
