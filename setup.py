@@ -7,7 +7,7 @@ from setuptools import find_packages, setup
 
 NAME = "limbloc_ros"
 SHARE = f"share/{NAME}"
-NODES = ("segmentation", "carving", "pose", "simulated_cameras", "replay", "record", "smart_space")
+NODES = ("segmentation", "carving", "pose", "simulated_cameras", "replay", "record", "composed", "smart_space")
 
 
 def files(pattern: str) -> list[str]:

@@ -53,6 +53,14 @@ class SimulationSettings:
     start_s: float = setting(
         0.0, "time since the epoch at which the simulation starts; 0: when the node does", unit="s", low=0.0, high=1e11
     )
+    wait_for_viewers_s: float = setting(
+        0.0,
+        "with start_s 0: start when every camera is watched, or after this long all the same, so that the room is "
+        "still empty when the other nodes are ready",
+        unit="s",
+        low=0.0,
+        high=3600.0,
+    )
     person: str = setting("man", "who moves", choices=("man", "woman", "child", "heavy"))
     motions: tuple[str, ...] = setting((), "names of motions in order, repeated for ever; empty: a varied sequence")
     empty_s: float = setting(2.0, "the room is empty this long at first", unit="s", low=0.0, high=3600.0)
@@ -96,8 +104,10 @@ class SimulatedCamerasNode(Node):
         self.meter, self.render_ms = Meter(), float("nan")
         self.health = Health(self, self.describe)
         self.period_ns = round(NANOSECONDS / s.rate_hz)
-        now = self.get_clock().now().nanoseconds
-        self.start_ns = (round(s.start_s * NANOSECONDS) or now) // self.period_ns * self.period_ns
+        self.start_ns: int | None = None
+        if s.start_s:
+            self.start_ns = round(s.start_s * NANOSECONDS) // self.period_ns * self.period_ns
+        self.made_s = time.monotonic()
         self.last_frame = -1
         # Looks four times per frame whether the next one is due, so that frames come at their stamps' pace.
         self.create_timer(
@@ -106,13 +116,24 @@ class SimulatedCamerasNode(Node):
 
     def on_timer(self) -> None:
         """Publish the newest frame that is due; under load frames are skipped, as a camera driver would."""
-        frame = (self.get_clock().now().nanoseconds - self.start_ns) // self.period_ns
+        now = self.get_clock().now().nanoseconds
+        if self.start_ns is None:
+            if not self._is_watched() and time.monotonic() - self.made_s < self.settings.wait_for_viewers_s:
+                return
+            self.start_ns = now // self.period_ns * self.period_ns
+        frame = (now - self.start_ns) // self.period_ns
         if frame > self.last_frame:
             self.last_frame = frame
             self.publish(frame)
 
+    def _is_watched(self) -> bool:
+        """Whether somebody subscribed to every camera."""
+        outputs = [[out[c.name] for out in (self.raw, self.jpeg) if c.name in out] for c in self.cameras]
+        return all(any(output.get_subscription_count() for output in of_camera) for of_camera in outputs)
+
     def publish(self, frame: int) -> None:
         """Render and publish one instant."""
+        assert self.start_ns is not None
         stamp, t = self.start_ns + frame * self.period_ns, frame * self.period_ns / NANOSECONDS
         started = time.thread_time()
         for camera in self.cameras:
@@ -158,3 +179,7 @@ class SimulatedCamerasNode(Node):
 def main() -> int:
     """Run the simulated cameras."""
     return node_main.main(SimulatedCamerasNode)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,179 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Runs several nodes in one process, with one executor: cheaper than a process each.
+
+The argument is a description in YAML (or JSON), or a file with it::
+
+    namespace: /lab                      # optional
+    nodes:
+      - kind: segmentation               # segmentation carving pose simulated_cameras replay record
+        name: segmentation_cam0
+        parameters: {camera: cam0, background.learning_rate: 0.02}
+"""
+
+from __future__ import annotations
+
+import ctypes
+import dataclasses
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from importlib import import_module
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import yaml
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.utilities import remove_ros_args
+
+from limbloc_ros.core.errors import ConfigError, LimblocError
+from limbloc_ros.ros import node_main
+
+#: Node classes by kind; their modules are imported when asked for, because each brings its own libraries.
+KINDS = {
+    "segmentation": "SegmentationNode",
+    "carving": "CarvingNode",
+    "pose": "PoseNode",
+    "simulated_cameras": "SimulatedCamerasNode",
+    "replay": "ReplayNode",
+    "record": "RecordNode",
+}
+
+#: Exit code when a node refused its parameters or input: starting again would not help.
+REFUSED = 2
+
+#: A process whose parent has died must be gone after this, s.
+ORPHAN_GRACE_S = 5.0
+
+_PR_SET_PDEATHSIG = 1
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run what the first argument describes, until a signal, the end of a replay or the death of `--parent PID`."""
+    everything = list(sys.argv if argv is None else argv)
+    arguments = remove_ros_args(everything)[1:]
+    parent = 0
+    if "--parent" in arguments:
+        at = arguments.index("--parent")
+        parent = int(arguments[at + 1])
+        del arguments[at : at + 2]
+        _die_with(parent)
+    if len(arguments) != 1:
+        print(__doc__, file=sys.stderr)
+        return REFUSED
+    nodes: list[Node] = []
+    refused = False
+
+    def make() -> list[Node]:
+        nonlocal refused
+        try:
+            build(parse(arguments[0]), nodes)
+        except LimblocError:
+            refused = True
+            raise
+        return nodes
+
+    def over() -> bool:
+        ends = [node.done for node in nodes if hasattr(node, "done")]
+        return bool(ends) and all(end.is_set() for end in ends)
+
+    # `until` is looked at after every callback, so it is only given where a node can end by itself.
+    finite = any(kind in arguments[0] for kind in ("replay", "record"))
+    code = node_main.main(make, everything, over if finite else None)
+    for node in nodes:
+        if hasattr(node, "summary"):
+            print(node.summary(), flush=True)
+    if refused or any(getattr(node, "error", None) for node in nodes):
+        return REFUSED
+    return code
+
+
+def parse(text: str) -> Mapping[str, Any]:
+    """The description from YAML text or the file that `text` names.
+
+    Raises:
+        ConfigError: no such file, not YAML, or no list of nodes in it.
+    """
+    try:
+        if "\n" not in text and "{" not in text:
+            text = Path(text).read_text(encoding="utf-8")
+        description = yaml.safe_load(text)
+    except (OSError, yaml.YAMLError) as error:
+        raise ConfigError(f"expected a description of nodes or a file with one: {error}") from error
+    if not isinstance(description, Mapping) or not isinstance(description.get("nodes"), list):
+        raise ConfigError("expected a description with a list of nodes, such as {nodes: [{kind: pose}]}")
+    return description
+
+
+def build(description: Mapping[str, Any], nodes: list[Node]) -> None:
+    """Make the described nodes and append them to `nodes`.
+
+    Raises:
+        ConfigError: an unknown kind of node, or a parameter that the node does not have.
+    """
+    for entry in description["nodes"]:
+        kind = entry.get("kind")
+        if kind not in KINDS:
+            raise ConfigError(f"nodes: kind: expected one of {', '.join(KINDS)}, got {kind!r}")
+        module = import_module(f"limbloc_ros.nodes.{kind}")
+        node_class = getattr(module, KINDS[kind])
+        values = _with_floats(module, flatten(entry.get("parameters") or {}))
+        node = node_class(
+            entry.get("name") or kind,
+            namespace=description.get("namespace") or "",
+            parameter_overrides=[Parameter(name, value=value) for name, value in values.items()],
+        )
+        nodes.append(node)
+        # rclpy ignores overrides that nobody declares: a misspelt parameter would go unnoticed.
+        if unknown := [name for name in values if not node.has_parameter(name)]:
+            known = sorted(n for n in node.get_parameters_by_prefix("") if not n.startswith("qos_overrides"))
+            raise ConfigError(
+                f"{entry.get('name') or kind} has no parameter {', '.join(unknown)}; it has {', '.join(known)}"
+            )
+
+
+def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Sections of parameters -> names with dots: `{hull: {voxel_m: 0.02}}` -> `{hull.voxel_m: 0.02}`."""
+    flat: dict[str, Any] = {}
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            flat |= flatten(value, f"{prefix}{name}.")
+        elif value not in ([], ()):  # rclpy cannot tell what an empty list holds; it is the default anyway
+            flat[f"{prefix}{name}"] = list(value) if isinstance(value, tuple) else value
+    return flat
+
+
+def _with_floats(module: ModuleType, values: Mapping[str, Any]) -> dict[str, Any]:
+    """People write 10 where a parameter is 10.0, which ROS refuses: convert what the node's settings say is a float."""
+    settings = [v for v in vars(module).values() if isinstance(v, type) and dataclasses.is_dataclass(v)]
+    defaults = [(f.name, type(f.default)) for kind in settings for f in dataclasses.fields(kind)]
+    floats = {name for name, kind in defaults if kind is float} - {name for name, kind in defaults if kind is not float}
+    return {
+        name: float(value) if type(value) is int and name.rpartition(".")[2] in floats else value
+        for name, value in values.items()
+    }
+
+
+def _die_with(parent: int) -> None:
+    """Have the system end this process when its parent dies, however that happens."""
+    if ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM) != 0:
+        raise OSError(ctypes.get_errno(), "prctl(PR_SET_PDEATHSIG) failed")
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(0.5)
+        # The signal asks for a clean stop; a process that hangs then must not stay for ever.
+        time.sleep(ORPHAN_GRACE_S)
+        os._exit(1)
+
+    if os.getppid() != parent:  # it died before we could ask
+        raise SystemExit(1)
+    threading.Thread(target=watch, name="watch parent", daemon=True).start()
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

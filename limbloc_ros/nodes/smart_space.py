@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The whole smart space from one YAML file: cameras, masks, hull, posture, in few processes."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+from rclpy.utilities import remove_ros_args
+
+from limbloc_ros.core.errors import ConfigError, LimblocError
+from limbloc_ros.ros.environment import config_file, graph_environment
+from limbloc_ros.ros.graph_plan import SmartSpaceConfig, load_config, plan_graph
+from limbloc_ros.ros.supervisor import Supervisor
+
+EXAMPLES = """examples:
+  smart_space                                          eight simulated cameras, and a person who moves
+  smart_space --source cameras --rig lab.yaml          your cameras; their drivers run already, or come later
+  smart_space --source bag --bag run1 --rig lab.yaml   a recording
+  smart_space my_room.yaml                             your own copy of config/smart_space.yaml
+  smart_space --set pose.fit.engine=paper --set processes.cameras_per_process=2
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options; `limbloc run` has the same."""
+    parser.add_argument("config", nargs="?", help="smart space file; default: the installed config/smart_space.yaml")
+    parser.add_argument("--source", choices=("simulated", "cameras", "bag"), help="where images come from")
+    parser.add_argument("--rig", metavar="FILE", help="rig file of the cameras")
+    parser.add_argument("--bag", metavar="BAG", help="recording to replay")
+    parser.add_argument("--cameras", metavar="A,B,...", help="only these cameras of the rig")
+    parser.add_argument("--record", metavar="FOLDER", help="record the run to this new folder")
+    parser.add_argument(
+        "--set",
+        metavar="KEY=VALUE",
+        action="append",
+        default=[],
+        help="any value of the file, e.g. pose.fit.engine=paper",
+    )
+
+
+def config_from_arguments(options: argparse.Namespace) -> SmartSpaceConfig:
+    """The file with the options on top.
+
+    Raises:
+        ConfigError: the file or an option is wrong.
+    """
+    overrides: dict[str, Any] = {}
+    for text in options.set:
+        key, equals, value = text.partition("=")
+        if not equals or not key:
+            raise ConfigError(f"--set: expected KEY=VALUE such as pose.fit.engine=paper, got {text!r}")
+        section, names = overrides, key.split(".")
+        for name in names[:-1]:
+            section = section.setdefault(name, {})
+            if not isinstance(section, dict):
+                raise ConfigError(f"--set: {key} lies inside of a value that was set before")
+        section[names[-1]] = yaml.safe_load(value)
+    for key, value in (("source", options.source), ("rig", options.rig), ("bag", options.bag)):
+        if value is not None:
+            overrides[key] = value
+    if options.record is not None:
+        overrides["record_to"] = options.record
+    if options.cameras is not None:
+        overrides["cameras"] = [name.strip() for name in options.cameras.split(",") if name.strip()]
+    return load_config(options.config or config_file("smart_space.yaml"), overrides)
+
+
+def run(config: SmartSpaceConfig) -> int:
+    """Plan, start, watch and stop; returns the exit code.
+
+    Raises:
+        LimblocError: the config, rig or bag cannot be used.
+    """
+    with tempfile.TemporaryDirectory(prefix="limbloc_") as folder:
+        plans = plan_graph(config, Path(folder))
+        environment = graph_environment(config.network)
+        print(f"smart space: source {config.source}, {len(plans)} processes. Ctrl-C stops everything")
+        for plan in plans:
+            print(f"  {plan.name}: {', '.join(node['name'] for node in plan.nodes)}")
+        sys.stdout.flush()
+        return Supervisor(plans, environment, config.processes).run()
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command line of `ros2 run limbloc_ros smart_space`."""
+    parser = argparse.ArgumentParser(
+        "smart_space", description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    add_arguments(parser)
+    options = parser.parse_args(remove_ros_args(list(sys.argv if argv is None else ["smart_space", *argv]))[1:])
+    try:
+        return run(config_from_arguments(options))
+    except LimblocError as error:
+        print(f"smart_space: {error}", file=sys.stderr)
+        return 1
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

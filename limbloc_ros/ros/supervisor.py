@@ -1,0 +1,234 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Starts the processes of a smart space, restarts the ones that die, and leaves none behind.
+
+It is no ROS node itself, so nothing in ROS can take it down. Every child leads a process group of its own: Ctrl-C in a
+terminal reaches only us, and we stop the children in order: interrupt, terminate, kill. A child also ends by itself
+when we are killed.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from types import FrameType
+
+from limbloc_ros.ros.graph_plan import ProcessConfig, ProcessPlan
+
+POLL_S = 0.1
+#: A process that has run this long starts with the short delay again when it dies.
+SETTLED_S = 30.0
+#: Exit code of `nodes.composed` when a node refused its parameters or input.
+REFUSED = 2
+
+
+class _Child:
+    """One process and what we know of its past."""
+
+    def __init__(self, plan: ProcessPlan) -> None:
+        self.plan = plan
+        self.process: subprocess.Popen[str] | None = None
+        self.reader: threading.Thread | None = None
+        self.started_s = 0.0
+        self.restart_at_s: float | None = None
+        self.deaths = 0
+        self.finished = False
+
+
+class Supervisor:
+    """Runs a plan's processes; use it as a context manager, or call `run`.
+
+    Args:
+        plans: the processes.
+        environment: variables added to this process's environment.
+        config: delays and patience.
+        say: gets every line of output, the children's with `[name] ` in front.
+
+    Attributes:
+        restarts: how often each process has been started again, by name.
+        failure: why the graph had to end; empty otherwise.
+    """
+
+    def __init__(
+        self,
+        plans: Sequence[ProcessPlan],
+        environment: Mapping[str, str],
+        config: ProcessConfig | None = None,
+        say: Callable[[str], None] | None = None,
+    ) -> None:
+        self.config = config or ProcessConfig()
+        self.restarts = {plan.name: 0 for plan in plans}
+        self.failure = ""
+        self._environment = {**os.environ, **environment}
+        self._say = say or _print
+        self._children = [_Child(plan) for plan in plans]
+        self._stop = threading.Event()
+        self._hurry = threading.Event()
+
+    def __enter__(self) -> Supervisor:
+        self.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+    @property
+    def pids(self) -> dict[str, int]:
+        """Process ids of what runs now, by name."""
+        return {c.plan.name: c.process.pid for c in self._children if c.process and c.process.poll() is None}
+
+    def start(self) -> None:
+        """Start all processes."""
+        try:
+            for child in self._children:
+                self._spawn(child)
+        except BaseException:
+            self.stop()
+            raise
+
+    def poll(self) -> bool:
+        """Look after the children once: restart what died. False when the graph is over or cannot go on."""
+        now = time.monotonic()
+        for child in self._children:
+            if child.restart_at_s is not None and now >= child.restart_at_s:
+                child.restart_at_s = None
+                self.restarts[child.plan.name] += 1
+                self._spawn(child)
+            if child.process is None or child.finished or child.restart_at_s is not None:
+                continue
+            code = child.process.poll()
+            if code is not None and not self._died(child, code, now):
+                return False
+        return True
+
+    def run(self) -> int:
+        """Start, watch until Ctrl-C, SIGTERM or the end of the graph, and stop everything.
+
+        A second signal stops without patience.
+
+        Returns:
+            exit code: 0, or 1 when a process could not run.
+        """
+        handlers = {s: signal.signal(s, self._on_signal) for s in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            self.start()
+            while not self._stop.is_set() and self.poll():
+                self._stop.wait(POLL_S)
+        finally:
+            self.stop()
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
+        if self.failure:
+            self._say(self.failure)
+        return 1 if self.failure else 0
+
+    def stop(self) -> None:
+        """End all processes: interrupt, then terminate, then kill. Returns when none is left."""
+        patience = ((signal.SIGINT, self.config.interrupt_s), (signal.SIGTERM, self.config.terminate_s))
+        for number, seconds in (*patience, (signal.SIGKILL, 10.0)):
+            alive = [child for child in self._children if _group_alive(child)]
+            if not alive:
+                break
+            if number != signal.SIGINT:
+                names = ", ".join(child.plan.name for child in alive)
+                self._say(f"{names} did not end in time; sending {number.name}")
+            for child in alive:
+                _signal_group(child, number)
+            deadline = time.monotonic() + seconds
+            while any(_group_alive(child) for child in alive) and time.monotonic() < deadline:
+                if self._hurry.is_set() and number == signal.SIGINT:
+                    break
+                time.sleep(0.05)
+        for child in self._children:
+            if child.process is not None:
+                child.process.wait()
+            if child.reader is not None:
+                child.reader.join()
+            child.restart_at_s = None
+
+    def _spawn(self, child: _Child) -> None:
+        arguments = [child.plan.description, "--parent", str(os.getpid())]
+        child.process = subprocess.Popen(
+            [sys.executable, "-m", "limbloc_ros.nodes.composed", *arguments],
+            env=self._environment,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            errors="replace",
+            start_new_session=True,
+        )
+        child.started_s = time.monotonic()
+        child.reader = threading.Thread(target=self._forward, args=(child.process, child.plan.name), daemon=True)
+        child.reader.start()
+
+    def _forward(self, process: subprocess.Popen[str], name: str) -> None:
+        assert process.stdout is not None
+        with process.stdout as lines:
+            for line in lines:
+                self._say(f"[{name}] {line.rstrip()}")
+
+    def _died(self, child: _Child, code: int, now: float) -> bool:
+        """A child has ended: plan its restart. False when that ends the graph."""
+        name = child.plan.name
+        if code == REFUSED:
+            self.failure = f"{name} cannot run as configured; see its message above"
+            return False
+        if code == 0 and child.plan.ends_graph:
+            self._say(f"{name} has ended, and the smart space with it")
+            return False
+        if code == 0 and all(node["kind"] in ("replay", "record") for node in child.plan.nodes):
+            self._say(f"{name} has ended")
+            child.finished = True
+            return True
+        _signal_group(child, signal.SIGKILL)  # whatever the dead process may have started
+        if now - child.started_s >= SETTLED_S:
+            child.deaths = 0
+        delay = min(self.config.restart_delay_s * 2.0**child.deaths, self.config.restart_max_delay_s)
+        child.deaths += 1
+        child.restart_at_s = now + delay
+        self._say(f"{name} died ({_cause(code)}); starting it again in {delay:g} s")
+        return True
+
+    def _on_signal(self, number: int, _: FrameType | None) -> None:
+        if self._stop.is_set():
+            self._hurry.set()
+        self._stop.set()
+
+
+def _signal_group(child: _Child, number: signal.Signals) -> None:
+    if child.process is not None:
+        try:
+            os.killpg(child.process.pid, number)
+        except ProcessLookupError:
+            return  # it was faster
+
+
+def _group_alive(child: _Child) -> bool:
+    """Whether the process or anything in its group still runs."""
+    if child.process is None:
+        return False
+    if child.process.poll() is None:
+        return True
+    try:
+        os.killpg(child.process.pid, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+def _cause(code: int) -> str:
+    if code >= 0:
+        return f"exit code {code}"
+    try:
+        return signal.Signals(-code).name
+    except ValueError:
+        return f"signal {-code}"
+
+
+def _print(line: str) -> None:
+    print(line, flush=True)
