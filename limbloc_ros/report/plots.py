@@ -44,6 +44,8 @@ STYLE: dict[str, Any] = {
     "savefig.facecolor": "white",
 }
 DPI = 110
+#: Height that is kept free for a legend above all plots, inch.
+LEGEND_IN = 0.42
 
 
 def new_figure(width_in: float, height_in: float) -> Figure:
@@ -199,7 +201,8 @@ def _small_multiples(
     time, time_unit = _time(run)
     rows = max(1, -(-len(panels) // columns))
     with rc_context(STYLE):
-        figure = new_figure(12, 0.7 + 2.05 * rows)
+        height = LEGEND_IN + 0.3 + 2.05 * rows
+        figure = new_figure(12, height)
         grid = figure.subplots(rows, columns, sharex=True, squeeze=False)
         for axes in grid.ravel()[len(panels) :]:
             axes.set_visible(False)
@@ -229,7 +232,9 @@ def _small_multiples(
         order = [text for text in ("left", "right", "middle", "jump") if text in shown]
         if order:
             handles = [shown[text] for text in order]
-            figure.legend(handles, order, loc="outside upper center", ncols=len(order), fontsize=12)
+            engine: Any = figure.get_layout_engine()
+            engine.set(rect=(0, 0, 1, 1 - LEGEND_IN / height))
+            figure.legend(handles, order, loc="upper center", ncols=len(order), fontsize=12)
     return figure
 
 
