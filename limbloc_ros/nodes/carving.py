@@ -27,7 +27,10 @@ from limbloc_ros.ros.parameters import NodeParameters
 from limbloc_ros.ros.rig_source import RigFromTopics, rig_from_file
 
 #: How often waiting sets are looked at.
-TICK_S = 0.02
+TICK_S = 0.005
+#: Finished sets that may wait to be carved. Older ones are skipped as a whole: when the machine is too slow, all
+#: cameras must lose the same frames, or the sets that are carved lack some of them.
+BACKLOG = 2
 
 
 @dataclass(frozen=True)
@@ -56,6 +59,7 @@ class CarvingNode(Node):
         self.carver: Carver | None = None
         self.rig_source: RigFromTopics | None = None
         self.synchroniser: StampSynchroniser[Pixels] | None = None
+        self.finished: list[FrameSet[Pixels]] = []
         self.hull = self.create_publisher(PointCloud2, topics.HULL, topics.STREAM_QOS)
         s = self.settings
         if s.rig_file:
@@ -81,6 +85,7 @@ class CarvingNode(Node):
     def use_rig(self, rig: Rig) -> None:
         """Carve with this rig from now on."""
         self.rig = rig
+        self.finished.clear()
         self.carver = Carver(rig, self.hull_config)
         self.synchroniser = StampSynchroniser.from_config(rig.names, self.sync_config, self.hull_config.min_cameras)
         self.get_logger().info(f"carving with {len(rig.cameras)} cameras: {', '.join(rig.names)}")
@@ -90,7 +95,7 @@ class CarvingNode(Node):
         return lambda msg: self.on_mask(camera, msg)
 
     def on_mask(self, camera: str, msg: Image | CompressedImage) -> None:
-        """One mask: into the synchroniser; whatever sets are complete then are carved."""
+        """One mask: into the synchroniser. Carving is left to the timer, so that masks never wait behind it."""
         if self.rig is None or self.synchroniser is None or camera not in self.rig.names:
             return  # the diagnostics say what is missing of the rig
         with self.health.guard(f"camera {camera}"):
@@ -103,27 +108,32 @@ class CarvingNode(Node):
                 )
             stamp = stamp_ns(msg.header)
             self.report.mask(camera, mask, self.health.latency_s(stamp))
-            self.carve(self.synchroniser.add(camera, stamp, mask, time.monotonic_ns()))
+            self.finished += self.synchroniser.add(camera, stamp, mask, time.monotonic_ns())
 
     def on_tick(self) -> None:
-        """Let incomplete sets go when their time is up."""
-        if self.synchroniser is not None:
-            self.carve(self.synchroniser.tick(time.monotonic_ns()))
+        """Let incomplete sets go when their time is up, and carve a finished one."""
+        if self.synchroniser is None:
+            return
+        self.finished += self.synchroniser.tick(time.monotonic_ns())
+        if len(self.finished) > BACKLOG:
+            self.report.skipped += len(self.finished) - BACKLOG
+            del self.finished[:-BACKLOG]
+        if self.finished:
+            self.carve(self.finished.pop(0))
 
-    def carve(self, sets: Sequence[FrameSet[Pixels]]) -> None:
-        """Carve finished sets and publish one hull each."""
-        for frames in sets:
-            assert self.carver is not None
-            header = make_header(frames.stamp_ns, self.settings.world_frame)
-            started = time.thread_time()
-            with self.health.guard("carving"):
-                hull = self.carver.carve(frames.items)
-                if isinstance(hull, NoPerson):
-                    self.hull.publish(cloud_messages.empty_hull_cloud(header))
-                else:
-                    self.hull.publish(cloud_messages.hull_to_cloud(hull, header))
-                carve_ms = 1e3 * (time.thread_time() - started)
-                self.report.carved(frames, hull, carve_ms, self.health.latency_s(frames.stamp_ns))
+    def carve(self, frames: FrameSet[Pixels]) -> None:
+        """Carve one set and publish its hull."""
+        assert self.carver is not None
+        header = make_header(frames.stamp_ns, self.settings.world_frame)
+        started = time.thread_time()
+        with self.health.guard("carving"):
+            hull = self.carver.carve(frames.items)
+            if isinstance(hull, NoPerson):
+                self.hull.publish(cloud_messages.empty_hull_cloud(header))
+            else:
+                self.hull.publish(cloud_messages.hull_to_cloud(hull, header))
+            carve_ms = 1e3 * (time.thread_time() - started)
+            self.report.carved(frames, hull, carve_ms, self.health.latency_s(frames.stamp_ns))
 
     def describe(self) -> Sequence[DiagnosticStatus]:
         """The hull, and one entry per camera."""
@@ -144,3 +154,7 @@ class CarvingNode(Node):
 def main() -> int:
     """Run the carving node."""
     return node_main.main(CarvingNode)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -148,3 +148,7 @@ class PoseNode(Node):
 def main() -> int:
     """Run the pose node."""
     return node_main.main(PoseNode)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

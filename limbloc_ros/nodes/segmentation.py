@@ -140,3 +140,7 @@ def background_picture(path: Path, camera: str) -> Pixels:
 def main() -> int:
     """Run one segmentation node."""
     return node_main.main(SegmentationNode)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

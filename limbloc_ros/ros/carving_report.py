@@ -25,6 +25,9 @@ class CarvingReport:
     Args:
         node: named in every entry; asked for what topics exist.
         topics: mask topic by camera.
+
+    Attributes:
+        skipped: finished sets that were not carved because newer ones had come.
     """
 
     def __init__(self, node: Node, topics: Mapping[str, str]) -> None:
@@ -33,6 +36,7 @@ class CarvingReport:
         self._masks = {camera: Meter() for camera in topics}
         self._fill = dict.fromkeys(topics, float("nan"))
         self._sets = Meter()
+        self.skipped = 0
         self._last: FrameSet[Pixels] | None = None
         self._outcome: Hull | NoPerson | None = None
         self._carve_ms = float("nan")
@@ -88,6 +92,7 @@ class CarvingReport:
             "sets_complete": counters.complete,
             "sets_incomplete": counters.incomplete,
             "sets_dropped": counters.dropped,
+            "sets_skipped": self.skipped,
             "sets_waiting": synchroniser.waiting if synchroniser else 0,
             "jumps_back_in_time": counters.resets,
         }

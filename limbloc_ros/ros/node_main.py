@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import signal
 import time
 from collections.abc import Callable, Sequence
 
@@ -12,6 +13,7 @@ from rclpy.context import Context
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.logging import get_logger
 from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
 
 from limbloc_ros.core.errors import LimblocError
 
@@ -53,7 +55,7 @@ def spin(
                 return True
             if deadline is not None and time.monotonic() > deadline:
                 return False
-            executor.spin_once(timeout_sec=0.1 if until is None else 0.01)
+            executor.spin_once(timeout_sec=0.02)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     finally:
@@ -80,15 +82,27 @@ def main(
     """
     cv2.setNumThreads(1)  # one process per stage already uses the cores; OpenCV's pool only adds waiting
     nodes: Sequence[Node] = ()
-    rclpy.init(args=None if args is None else list(args))
+    spinning = stopped = False
+
+    def on_signal(*_: object) -> None:
+        nonlocal stopped
+        stopped = True
+        if not spinning:  # a start that compiles kernels takes a while; nobody wants to wait for its end
+            raise KeyboardInterrupt
+
+    # rclpy's own handlers invalidate the context at once, and a callback that is just publishing then fails.
+    rclpy.init(args=None if args is None else list(args), signal_handler_options=SignalHandlerOptions.NO)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, on_signal)
     try:
         made = make_nodes()
         nodes = [made] if isinstance(made, Node) else made
-        spin(nodes, until=until)
+        spinning = True
+        spin(nodes, until=lambda: stopped or (until is not None and until()))
     except LimblocError as error:
         get_logger("limbloc").fatal(str(error))
         return 1
-    except (KeyboardInterrupt, ExternalShutdownException):
+    except KeyboardInterrupt:
         pass
     finally:
         for node in nodes:
