@@ -193,6 +193,26 @@ def test_bone_lengths_never_change_and_joints_stay_in_the_body(name: str) -> Non
     np.testing.assert_allclose(lengths[0][::2], lengths[0][1::2], rtol=0.02)
 
 
+@pytest.mark.parametrize("name", PERSON_NAMES)
+def test_joints_lie_inside_the_skin(name: str) -> None:
+    motion = Motion(load_person(name), seed=1)
+    for t in TIMES[::8]:
+        posed = motion.pose(t)
+        assert posed is not None
+        # The winding number: how much of the sphere around a point the mesh covers, 1 inside and 0 outside.
+        corners = posed.vertices[motion.person.faces][None] - posed.joints[:, None, None]
+        a, b, c = (corners[:, :, k] / np.linalg.norm(corners[:, :, k], axis=-1, keepdims=True) for k in range(3))
+        top = np.einsum("jfi,jfi->jf", a, np.cross(b, c))
+        bottom = 1 + (a * b).sum(-1) + (b * c).sum(-1) + (c * a).sum(-1)
+        winding = np.arctan2(top, bottom).sum(1) / (2 * np.pi)
+        for joint, inside in zip(JOINT_NAMES, winding, strict=True):
+            if joint.startswith(("head_top", "fingertip", "toe", "heel")):  # taken from the skin of a finer mesh
+                nearest = np.linalg.norm(posed.vertices - posed.joints[JOINT[joint]], axis=1).min()
+                assert inside > 0.5 or nearest < 0.03, (joint, t)
+            else:
+                assert inside > 0.5, (joint, t, motion.action(t))
+
+
 def test_somebody_who_does_not_jump_touches_the_floor(man_motion: Motion) -> None:
     highest = {}
     for t in np.arange(1.6, man_motion.duration_s, 0.1):
@@ -206,7 +226,7 @@ def test_somebody_who_does_not_jump_touches_the_floor(man_motion: Motion) -> Non
                 assert posed.joints[JOINT[f"ankle_{side}"], 2] < 0.16
     assert highest["jump"] > 0.15
     for action in ("wave", "squat", "sit", "reach", "stretch", "point", "dance"):
-        assert highest[action] < 0.08, action
+        assert highest[action] < 0.1, action
 
 
 def test_feet_stay_where_they_are_during_planted_motions(man_motion: Motion) -> None:
@@ -426,7 +446,7 @@ def test_the_floor_lies_where_the_camera_projects_it() -> None:
 
 
 def quiet_room(**changes: object) -> SimulatedRoom:
-    return SimulatedRoom(default_rig(4, 320, 240), seed=3, **{"noise_sigma": 0.0, "light_drift": 0.0, **changes})
+    return SimulatedRoom(default_rig(4, 320, 240), **{"seed": 3, "noise_sigma": 0.0, "light_drift": 0.0, **changes})
 
 
 def test_noise_has_the_wanted_spread_and_is_new_in_every_frame_and_camera() -> None:
@@ -470,13 +490,15 @@ def test_the_person_throws_a_shadow_on_the_floor_and_changes_nothing_else() -> N
     assert np.ptp(ratio, axis=1).max() < 0.1  # a shadow keeps the colour
 
 
-def test_clothes_come_close_to_the_background_in_places_but_mostly_differ() -> None:
-    room = quiet_room()
+@pytest.mark.parametrize("name", ["man", "child"])
+def test_the_person_stands_out_from_the_room_but_not_everywhere(name: str) -> None:
+    room = quiet_room(person=name)
     contrasts = []
-    for name in room.rig.names:
-        empty = room.render(name, 0.0).astype(int)
-        image, mask = room.render_with_mask(name, 7.0)
-        contrasts.append(np.abs(image.astype(int) - empty).max(-1)[mask > 0])
+    for camera in room.rig.names:
+        empty = room.render(camera, 0.0).astype(int)
+        for t in (6.0, 14.0, 22.0):
+            image, mask = room.render_with_mask(camera, t)
+            contrasts.append(np.abs(image.astype(int) - empty).max(-1)[mask > 0])
     contrast = np.concatenate(contrasts)
-    assert np.mean(contrast > 12) > 0.85
-    assert np.mean(contrast <= 12) > 0.003
+    assert np.mean(contrast > 12) > 0.9
+    assert np.mean(contrast <= 24) > 0.002

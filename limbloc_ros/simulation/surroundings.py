@@ -48,7 +48,7 @@ def _floor(rng: np.random.Generator) -> Image:
         end = -int(rng.integers(0, _size(1.3)))
         while end < n:
             begin, end = end, end + int(rng.integers(_size(0.9), _size(1.6)))
-            image[row : row + plank, max(begin, 0) : end] = np.array([92, 124, 152]) * rng.uniform(0.86, 1.1)
+            image[row : row + plank, max(begin, 0) : end] = np.array([126, 140, 150]) * rng.uniform(0.86, 1.1)
             image[row : row + plank, max(begin, 0) : max(begin, 0) + 1] *= 0.6
         image[row : row + 1] *= 0.6
     image *= (1 + _cloud(rng, (n, n), (0.012, 0.25), 0.05) + _cloud(rng, (n, n), (0.5, 0.5), 0.03))[..., None]
