@@ -85,6 +85,7 @@ class RecordNode(Node):
         self.path = Path(s.bag or datetime.now().strftime("limbloc_%Y%m%d_%H%M%S"))
         self.writer = BagWriter(self.path, s.storage)
         self._started = time.monotonic()
+        self._times: dict[str, tuple[float, float]] = {}
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._discovery = self.create_timer(DISCOVERY_PERIOD_S, self.discover, clock=steady)
         self.get_logger().info(f"recording to {self.path}")
@@ -106,12 +107,13 @@ class RecordNode(Node):
     def summary(self) -> str:
         """What was recorded, as a table for people."""
         total = sum(self.writer.counts.values())
-        seconds = time.monotonic() - self._started
         lines = [f"recorded {total} messages, {self.writer.bytes_written / 2**20:.1f} MB, in {self.path}:"]
         if not total:
             lines.append("  nothing: no such topic was published. `ros2 topic list` shows what there is")
         for name, count in sorted(self.writer.counts.items()):
-            lines.append(f"  {count:8d}  {count / seconds:7.1f} Hz  {name}")
+            first, last = self._times.get(name, (0.0, 0.0))
+            rate = f"{(count - 1) / (last - first):7.1f} Hz" if last > first else " " * 10
+            lines.append(f"  {count:8d}  {rate}  {name}")
         return "\n".join(lines)
 
     def discover(self) -> None:
@@ -172,6 +174,9 @@ class RecordNode(Node):
                 self.writer.write(name, self.get_clock().now().nanoseconds, cdr)
             except OutputError as error:
                 self._fail(error)
+                return
+            now = time.monotonic()
+            self._times[name] = (self._times.get(name, (now,))[0], now)
 
         return write
 
