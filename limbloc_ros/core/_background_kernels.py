@@ -199,7 +199,7 @@ def light_gain(image: Bytes, level: Words, busy: Bytes, last: Floats, stride: in
                 v = image[c, y, x]
                 if busy[y, x] == 0 and m > 20.0 and v < 250 and abs(v - centre * m) <= 0.08 * centre * m + 2.0:
                     top += v
-                    bottom += m
+                    bottom += float(m)
         if bottom > 0.0:
             gain[c] = min(max(top / bottom, 0.2), 5.0)
     return gain
