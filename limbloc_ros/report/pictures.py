@@ -17,6 +17,7 @@ from limbloc_ros.report.mesh import (
     SIDE_COLOURS,
     Mesh,
     balls,
+    capsule,
     flesh_figure_mesh,
     hull_mesh,
     needles,
@@ -38,6 +39,8 @@ CURVATURE_MAP = ListedColormap(colormaps["YlGnBu"](np.linspace(0.04, 1.0, 256)),
 GEODESIC_MAP: Colormap = colormaps["viridis"]
 #: A darker line on the geodesic map at every multiple of this.
 ISOLINE_M = 0.1
+#: Anchor points that are joined by a rod when both were found.
+ANCHOR_CHAIN = (("knee", "ankle"), ("ankle", "toe"), ("elbow", "wrist"), ("wrist", "fingertip"))
 
 
 def heading_rad(joints: Array) -> float:
@@ -174,7 +177,13 @@ def anchors_sheet(run: RunData, samples: Sequence[Sample]) -> Figure:
     """Figs. 6 and 7: the points that the paper's engine found on the hull, left blue and right orange."""
 
     def layers(sample: Sample, hull: Mesh) -> list[Layer]:
-        points = Mesh.join(balls([at], 0.035, SIDE_COLOURS[side_of(name)]) for name, at in sample.anchors.items())
+        found = sample.anchors
+        rods = [
+            capsule(found[a], found[b], 0.008, 0.008, SIDE_COLOURS[side_of(a)])
+            for a, b in ((f"{a}_{side}", f"{b}_{side}") for a, b in ANCHOR_CHAIN for side in "LR")
+            if a in found and b in found
+        ]
+        points = Mesh.join([*rods, *(balls([at], 0.032, SIDE_COLOURS[side_of(name)]) for name, at in found.items())])
         return [glass(hull), Layer(points)]
 
     pictures = panels(samples, layers, turns_rad=(0.45, 0.45 + np.pi / 2))

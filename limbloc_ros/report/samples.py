@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from limbloc_ros.core.camera import Rig
 from limbloc_ros.core.config import HullConfig
+from limbloc_ros.core.engine_paper import fit_state
 from limbloc_ros.core.geodesic import geodesic_map
 from limbloc_ros.core.hull import Hull, carve
 from limbloc_ros.core.pose import Array, Pose
@@ -30,7 +31,8 @@ class Sample:
         surface: the hull's surface.
         geodesic: [N] geodesic distance of each surface point from the centre of mass, m (inf where out of reach).
         pose: the fitted pose.
-        anchors: points that the paper's engine went by, [3] m by name (`knee_L`, ...), for figs. 6 and 7.
+        anchors: points that the paper's engine went by, [3] m by name (`knee_L`, ...; see `paper_anchors`), for figs. 6
+            and 7.
         images: camera name -> uint8 bgr [H, W, 3] image or [H, W] mask, for overlays; empty for none.
         rig: the cameras of the images.
     """
@@ -79,6 +81,7 @@ def carve_samples(
     rig: Rig,
     config: HullConfig | None = None,
     images_of: Callable[[int], Images] | None = None,
+    anchors_of: Callable[[Hull], Mapping[str, Array]] | None = None,
 ) -> list[Sample]:
     """Samples of a recorded run: its poses, with the hulls carved anew.
 
@@ -89,6 +92,7 @@ def carve_samples(
         rig: the cameras.
         config: as the run was made with.
         images_of: frame -> images by camera name, for the overlays; by default the masks are shown.
+        anchors_of: hull -> anchor points, e.g. `paper_anchors` for a run of the paper's engine.
     """
     samples = []
     for frame in frames:
@@ -96,5 +100,22 @@ def carve_samples(
         hull = carve(masks, rig, config or HullConfig())
         if isinstance(pose, Pose) and isinstance(hull, Hull):
             images = masks if images_of is None else images_of(frame)
-            samples.append(Sample.of(frame, hull, pose, images=images, rig=rig))
+            anchors = None if anchors_of is None else anchors_of(hull)
+            samples.append(Sample.of(frame, hull, pose, anchors=anchors, images=images, rig=rig))
     return samples
+
+
+def paper_anchors(hull: Hull) -> dict[str, Array]:
+    """The points that the paper's engine goes by in this hull, found anew: as slow as a fit by that engine.
+
+    Returns:
+        [3] m by name: `head`, `centre_of_mass`, and of each limb found `knee_L`, `ankle_L`, `toe_L`, ... or `elbow_L`,
+        `wrist_L`, `fingertip_L`, ...
+    """
+    branch, seen = fit_state(hull)
+    points = {"head": branch.head.centre, "centre_of_mass": seen.centre_of_mass}
+    for name, limb in branch.limbs.items():
+        kind, side = name.split("_")
+        joints = ("knee", "ankle", "toe") if kind == "leg" else ("elbow", "wrist", "fingertip")
+        points |= {f"{joint}_{side}": point for joint, point in zip(joints, limb.points, strict=True)}
+    return points
