@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The launch file and the files in config/, as far as that goes without ROS 2's launch (it has no wheel).
+
+The launch file starts what `plan_graph` says; test_smart_space.py runs those plans for real.
+"""
+
+import ast
+import xml.etree.ElementTree as ET
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+import yaml
+
+import limbloc_ros
+from limbloc_ros.nodes.composed import KINDS, flatten
+from limbloc_ros.rig.rig_file import load_rig
+from limbloc_ros.ros import topics
+from limbloc_ros.ros.cloud_messages import SURFACE_POINT
+from limbloc_ros.ros.environment import share_folder
+from limbloc_ros.ros.graph_plan import NODE_SECTIONS, SmartSpaceConfig
+
+ROOT = Path(limbloc_ros.__file__).parent.parent
+LAUNCH = ROOT / "launch" / "smart_space.launch.py"
+CONFIG = ROOT / "config"
+
+
+def launch_arguments():
+    """The literal ARGUMENTS of the launch file."""
+    tree = ast.parse(LAUNCH.read_text(encoding="utf-8"))
+    (value,) = [
+        node.value
+        for node in tree.body
+        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name) and node.targets[0].id == "ARGUMENTS"
+    ]
+    return ast.literal_eval(value)
+
+
+def test_launch_arguments_are_keys_of_the_config():
+    known = {field.name for field in fields(SmartSpaceConfig)}
+    arguments = launch_arguments()
+    assert {"source", "rig", "bag", "cameras"} <= set(arguments)
+    assert set(arguments) - {"config", "rviz", "record"} <= known
+    assert all(len(text) > 5 for _, text in arguments.values())
+
+
+def test_everything_the_launch_file_imports_from_us_exists():
+    for node in ast.walk(ast.parse(LAUNCH.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("limbloc_ros"):
+            module = __import__(node.module, fromlist=[alias.name for alias in node.names])
+            for alias in node.names:
+                assert hasattr(module, alias.name), f"{node.module}.{alias.name}"
+
+
+def test_the_executable_that_it_starts_is_installed():
+    assert '"composed"' in (ROOT / "setup.py").read_text(encoding="utf-8")
+    assert 'executable="composed"' in LAUNCH.read_text(encoding="utf-8")
+
+
+def test_the_launch_file_and_config_are_found_where_they_are():
+    assert share_folder() == ROOT
+    for name in ("smart_space.yaml", "fastdds.xml", "limbloc.rviz", "rig_example.yaml"):
+        assert (CONFIG / name).is_file()
+
+
+def test_every_parameter_in_the_installed_file_exists():
+    from importlib import import_module
+
+    from limbloc_ros.core.config import from_mapping
+    from limbloc_ros.ros.graph_plan import load_config
+
+    config = load_config(CONFIG / "smart_space.yaml")
+    for section in NODE_SECTIONS:
+        module = import_module(f"limbloc_ros.nodes.{section}")
+        settings = [v for v in vars(module).values() if isinstance(v, type) and hasattr(v, "__dataclass_fields__")]
+        known = {field.name: kind for kind in settings for field in fields(kind)}
+        for name, value in flatten(getattr(config, section)).items():
+            leaf = name.rpartition(".")[2]
+            assert leaf in known, f"{section}: {name}"
+            from_mapping(known[leaf], {leaf: value})  # right type and within its bounds
+
+
+def test_node_sections_are_the_nodes():
+    assert set(NODE_SECTIONS) == set(KINDS)
+
+
+def test_the_rig_example_is_a_rig_whose_cameras_see_the_volume():
+    rig = load_rig(CONFIG / "rig_example.yaml")
+    centre = (rig.volume_min + rig.volume_max) / 2
+    for camera in rig.cameras:
+        uv, depth = camera.world_to_image(centre)
+        assert depth > 1.0
+        assert 0 <= uv[0] < camera.width and 0 <= uv[1] < camera.height
+
+
+def test_the_dds_profile_is_the_default_one_with_large_segments():
+    space = {"d": "http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles"}
+    root = ET.parse(CONFIG / "fastdds.xml").getroot()
+    shared = [t for t in root.iterfind(".//d:transport_descriptor", space) if t.findtext("d:type", "", space) == "SHM"]
+    assert int(shared[0].findtext("d:segment_size", "0", space)) == 16 * 2**20
+    assert int(shared[0].findtext("d:maxMessageSize", "0", space)) == 4 * 2**20
+    participant = root.find(".//d:participant", space)
+    assert participant is not None and participant.get("is_default_profile") == "true"
+
+
+@pytest.mark.parametrize("topic", [topics.HULL, topics.SURFACE, topics.MARKERS, topics.TRUE_JOINTS])
+def test_rviz_shows_topics_that_exist(topic):
+    view = yaml.safe_load((CONFIG / "limbloc.rviz").read_text(encoding="utf-8"))["Visualization Manager"]
+    shown = {d["Topic"]["Value"] for d in view["Displays"] if "Topic" in d}
+    assert f"/{topic}" in shown
+    channels = {d["Channel Name"] for d in view["Displays"] if "Channel Name" in d}
+    assert channels <= set(SURFACE_POINT.names)
+    assert view["Global Options"]["Fixed Frame"] == "room"
