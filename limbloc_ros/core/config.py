@@ -66,7 +66,7 @@ class BackgroundConfig:
         "must somewhere reach twice this",
         unit="sigma",
         low=0.0,
-        high=50.0,
+        high=15.0,
         live=True,
     )
     edge_fraction: float = setting(
@@ -117,6 +117,11 @@ class HullConfig:
         0.05,
         "a voxel that one camera denies stays when it lies this deep inside all other silhouettes (doubled below 6 cameras)",
         unit="m", low=0.0, high=1.0, live=True,
+    )
+    shared_veto: float = setting(
+        0.7,
+        "how far, with six cameras or more that contradict each other, the hull goes from what all see to what all but one see",
+        low=0.0, high=1.0, live=True,
     )
     min_voxels: int = setting(500, "smaller hulls are no person", unit="voxels", low=1, high=10_000_000, live=True)
 

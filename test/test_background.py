@@ -1,0 +1,490 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Segmentation: pixels worked by hand, kernels against plain NumPy, properties, and a rendered walk."""
+
+import dataclasses
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from limbloc_ros.core import _background_kernels as kernels
+from limbloc_ros.core.background import PATIENCE, BackgroundModel, estimate_background
+from limbloc_ros.core.config import BackgroundConfig
+from limbloc_ros.core.errors import ConfigError, InputError
+
+WALK = Path(__file__).parent / "data" / "rgb_walk"
+HEIGHT, WIDTH = 96, 128
+COLOUR = np.array([90, 120, 150], dtype=np.float64)
+PERSON = (slice(30, 70), slice(50, 70))
+
+
+def room(rng, noise=1.0, light=1.0, shape=(HEIGHT, WIDTH)):
+    """A wall with a smooth pattern under a light, with sensor noise."""
+    y, x = np.mgrid[: shape[0], : shape[1]]
+    pattern = 1 + 0.2 * np.sin(x / 17) * np.cos(y / 23)
+    image = COLOUR * pattern[..., None] * light + rng.normal(0, noise, (*shape, 3))
+    return np.clip(np.rint(image), 0, 255).astype(np.uint8)
+
+
+def learned(rng, config=None, **kwargs):
+    model = BackgroundModel(config)
+    for _ in range(model.config.learning_frames):
+        assert model.segment(room(rng, **kwargs)).learning
+    return model
+
+
+def iou(a, b):
+    return np.count_nonzero(a & b) / np.count_nonzero(a | b)
+
+
+def measured(image, mean, variance, gain=(1, 1, 1), floor=2.0, darkest=0.5, brightest=1.0):
+    """The compiled measurement of an [H, W, 3] image, in sigmas."""
+    f = np.float32
+    planar = [np.ascontiguousarray(np.asarray(a, dtype=f).transpose(2, 0, 1)) for a in (mean, variance)]
+    level = np.empty(planar[0].shape, dtype=np.uint16)
+    sharpness = np.empty_like(level)
+    kernels.fix_all(*planar, f(floor**2), f(1), level, sharpness)
+    change = np.empty(image.shape[:2], dtype=np.uint8)
+    colour = np.empty_like(change)
+    kernels.measure(
+        np.ascontiguousarray(image.transpose(2, 0, 1)), level, sharpness, np.array(gain, dtype=f), f(darkest),
+        f(brightest), change, colour,
+    )  # fmt: skip
+    return change / kernels.CHANGE_SCALE, colour / kernels.COLOUR_SCALE
+
+
+class TestPixels:
+    """One pixel at a time; sigma is the floor, 2 grey levels."""
+
+    def one(self, pixel, mean=(100, 120, 80), **kwargs):
+        image = np.full((1, 1, 3), pixel, dtype=np.uint8)
+        change, colour = measured(image, np.full((1, 1, 3), mean), np.zeros((1, 1, 3)), **kwargs)
+        return change[0, 0], colour[0, 0]
+
+    def test_the_background_itself_has_no_distance(self):
+        assert self.one((100, 120, 80)) == (0, 0)
+
+    def test_distance_is_in_sigmas(self):
+        # 6 levels in one channel, 8 in another: 10 levels, 5 sigmas.
+        assert self.one((106, 128, 80))[0] == 5
+
+    def test_a_shadow_keeps_the_colour(self):
+        # 0.8 of the background: 0.2 * |(100, 120, 80)| = 0.2 * 175.5 = 35.1 levels = 17.5 sigmas.
+        change, colour = self.one((80, 96, 64))
+        assert change == 17.5
+        assert colour == 0
+
+    def test_darker_than_a_shadow_is_foreground(self):
+        # 0.25 of the background is 0.25 * 175.5 = 43.9 levels, 21.9 sigmas, from the darkest shadow (0.5).
+        assert self.one((25, 30, 20))[1] == pytest.approx(21.9, abs=0.15)
+
+    def test_brighter_than_the_brightest_highlight_is_foreground(self):
+        assert self.one((110, 132, 88))[1] == pytest.approx(0.1 * 175.5 / 2, abs=0.15)
+        assert self.one((110, 132, 88), brightest=1.2)[1] == 0
+
+    def test_another_colour_is_no_shadow(self):
+        # The nearest point of the line through black and the background, by orthogonal projection.
+        scale = (60 * 100 + 120 * 120 + 80 * 80) / (100**2 + 120**2 + 80**2)
+        away = np.linalg.norm(np.array([60, 120, 80]) - scale * np.array([100, 120, 80]))
+        assert self.one((60, 120, 80))[1] == pytest.approx(away / 2, abs=0.13)
+
+    def test_the_gain_of_the_light_moves_the_expectation(self):
+        assert self.one((80, 96, 64), gain=(0.8, 0.8, 0.8)) == (0, 0)
+
+    def test_an_overexposed_background_is_expected_at_white(self):
+        assert self.one((255, 255, 255), mean=(250, 250, 250), gain=(1.2, 1.2, 1.2)) == (0, 0)
+
+
+class TestKernels:
+    """Compiled loops against plain NumPy."""
+
+    def test_measure(self):
+        rng = np.random.default_rng(1)
+        shape = (37, 700, 3)  # more than two strips wide
+        image = rng.integers(0, 256, shape, dtype=np.uint8)
+        mean, variance = rng.uniform(0, 255, shape), rng.uniform(0, 400, shape)
+        gain = np.array([0.9, 1.0, 1.2])
+        expected = np.minimum(mean * gain, 255)
+        precision = 1 / (variance + 4)
+        far = np.sqrt(((image - expected) ** 2 * precision).sum(axis=2))
+        scale = (image * expected * precision).sum(axis=2) / (expected**2 * precision).sum(axis=2)
+        near = np.clip(scale, 0.5, 1.1)[..., None] * expected
+        rest = np.sqrt(((image - near) ** 2 * precision).sum(axis=2))
+        change, colour = measured(image, mean, variance, gain, brightest=1.1)
+        unit = 1 / kernels.CHANGE_SCALE, 1 / kernels.COLOUR_SCALE
+        assert np.abs(change - np.minimum(far, 127.5)).max() < 1.5 * unit[0]
+        assert np.abs(colour - np.minimum(rest, 255 * unit[1])).max() < 1.5 * unit[1]
+
+    def test_learn(self):
+        rng = np.random.default_rng(2)
+        shape = (3, 24, 50)
+        image = rng.integers(0, 256, shape, dtype=np.uint8)
+        mean, variance = rng.uniform(0, 255, shape).astype(np.float32), rng.uniform(0, 99, shape).astype(np.float32)
+        busy = (rng.random(shape[1:]) < 0.3).astype(np.uint8)
+        change = rng.integers(0, 20, shape[1:], dtype=np.uint8)
+        gain = np.array([0.8, 1.0, 1.1], dtype=np.float32)
+        level, sharpness = np.zeros(shape, dtype=np.uint16), np.zeros(shape, dtype=np.uint16)
+        rows = np.zeros(shape[1:], dtype=bool)
+        rows[1::4] = True
+        may = (busy == 0) & (change < 8) & rows & (image < 254)
+        off = image / gain[:, None, None] - mean
+        new_mean = np.where(may, mean + 0.1 * off, mean)
+        new_variance = np.where(may, 0.9 * (variance + 0.1 * off**2), variance)
+        f = np.float32
+        kernels.learn(
+            image, mean, variance, level, sharpness, gain, busy, change, f(8), f(0.1), f(4), f(1), 1, 4
+        )  # fmt: skip
+        np.testing.assert_allclose(mean, new_mean, rtol=1e-5, atol=1e-3)
+        np.testing.assert_allclose(variance, new_variance, rtol=1e-4, atol=1e-2)
+        assert np.abs(level[:, 1::4] / kernels.LEVEL_SCALE - new_mean[:, 1::4]).max() < 0.6 / kernels.LEVEL_SCALE
+        sigma = np.sqrt(new_variance + 4)[:, 1::4]
+        assert np.abs(sharpness[:, 1::4] - kernels.SHARPNESS_SCALE / sigma).max() < 0.6
+        assert not level[:, 0::4].any()
+
+    @given(st.tuples(*[st.floats(0.4, 1.6)] * 3), st.integers(0, 5))
+    @settings(max_examples=30, deadline=None)
+    def test_light_gain_ignores_a_person(self, gain, seed):
+        rng = np.random.default_rng(seed)
+        mean = rng.uniform(40, 140, (3, 60, 80))
+        image = np.clip(np.rint(mean * np.array(gain)[:, None, None] + rng.normal(0, 1.5, mean.shape)), 0, 255)
+        image[:, 10:50, 20:45] = 30  # a fifth of the image, unknown to the model
+        level = np.rint(mean * kernels.LEVEL_SCALE).astype(np.uint16)
+        nobody = np.zeros((60, 80), dtype=np.uint8)
+        found = kernels.light_gain(image.astype(np.uint8), level, nobody, np.ones(3, dtype=np.float32), 2)
+        np.testing.assert_allclose(found, gain, rtol=0.02)
+
+    def test_light_gain_keeps_the_last_one_in_the_dark(self):
+        black = np.zeros((3, 40, 40), dtype=np.uint8)
+        last = np.array([0.7, 0.8, 0.9], dtype=np.float32)
+        nobody = np.zeros((40, 40), dtype=np.uint8)
+        found = kernels.light_gain(black, black.astype(np.uint16), nobody, last, 1)
+        np.testing.assert_array_equal(found, last)
+
+    @given(st.integers(0, 1000))
+    @settings(max_examples=25, deadline=None)
+    def test_hysteresis_keeps_whole_parts(self, seed):
+        rng = np.random.default_rng(seed)
+        weak = (rng.random((33, 47)) < 0.45).astype(np.uint8) * 255
+        weak[[0, -1]] = 0
+        weak[:, [0, -1]] = 0
+        strong = weak * (rng.random(weak.shape) < 0.03)
+        _, labels = cv2.connectedComponents(weak, connectivity=8)
+        kept = np.isin(labels, np.unique(labels[strong > 0])) & (weak > 0)
+        np.testing.assert_array_equal(kernels.grow_from_seeds(weak, strong.astype(np.uint8)) > 0, kept)
+
+    def test_body_parts_by_hand(self):
+        mask = np.zeros((12, 12), dtype=np.uint8)
+        mask[2:10, 2:10] = 255
+        mask[4:6, 4:6] = 0  # a hole: 8 border pixels' worth beside the mask, none beside background
+        mask[9, 6] = 0  # a notch: three sides mask, one background
+        changed = np.where(mask > 0, 50, 0).astype(np.uint8)
+        changed[4:6, 4:6] = 30
+        changed[9:11, 6] = 30  # the notch and one pixel that sticks out below it
+        colour = np.full_like(mask, 20)
+
+        def added(colour, ratio):
+            out = mask.copy()
+            kernels.add_body_parts(out, changed, colour, 8, 10.0, ratio)
+            return sorted(zip(*np.nonzero(out != mask), strict=True))
+
+        hole = [(4, 4), (4, 5), (5, 4), (5, 5)]
+        assert added(colour, 0.7) == [*hole, (9, 6), (10, 6)]  # 1 pixel beside the mask, 1 beside background
+        assert added(colour, 1.0) == hole
+        assert added(np.zeros_like(mask), 0.7) == []  # the background's very colour: a shadow
+
+    def test_densest_mean_finds_the_crowd(self):
+        rng = np.random.default_rng(4)
+        samples = rng.integers(0, 256, (15, 5, 6, 3), dtype=np.uint8)
+        gains = rng.uniform(0.8, 1.2, (15, 3)).astype(np.float32)
+        mean, sigma = kernels.densest_mean(samples, gains, 0.4)
+        values = samples / gains[:, None, None]
+        for y in range(5):
+            for x in range(6):
+                order = np.argsort(values[:, y, x].sum(axis=1))
+                total = values[order, y, x].sum(axis=1)
+                best = np.argmin(total[5:] - total[:-5])  # 6 of 15
+                crowd = values[order[best : best + 6], y, x]
+                np.testing.assert_allclose(mean[y, x], crowd.mean(axis=0), rtol=1e-4)
+                np.testing.assert_allclose(sigma[y, x], crowd.std(axis=0), rtol=1e-2)
+
+
+class TestScenes:
+    def test_an_empty_room_gives_an_empty_mask(self):
+        rng = np.random.default_rng(0)
+        model = learned(rng, noise=2.5)
+        for _ in range(30):
+            result = model.segment(room(rng, noise=2.5))
+            assert not result.learning
+            assert not result.mask.any()
+            assert result.foreground_fraction == 0
+
+    def test_the_mask_is_empty_while_learning(self):
+        rng = np.random.default_rng(0)
+        model = BackgroundModel(BackgroundConfig(learning_frames=3))
+        for n in range(3):
+            image = room(rng)
+            image[PERSON] = (20, 200, 20)
+            result = model.segment(image)
+            assert result.learning
+            assert result.frames_learned == n + 1
+            assert not result.mask.any()
+        assert not model.learning
+
+    def test_a_person_is_found_where_he_stands(self):
+        rng = np.random.default_rng(1)
+        model = learned(rng)
+        image = room(rng)
+        image[PERSON] = (30, 160, 60)
+        truth = np.zeros((HEIGHT, WIDTH), dtype=bool)
+        truth[PERSON] = True
+        mask = model.segment(image).mask
+        assert mask.dtype == np.uint8
+        assert set(np.unique(mask)) == {0, 255}
+        assert iou(mask > 0, truth) > 0.98
+
+    def test_the_blur_of_the_lens_does_not_move_the_outline(self):
+        rng = np.random.default_rng(1)
+        model = learned(rng)
+        sharp = room(rng, noise=0).astype(np.float32)
+        sharp[PERSON] = (30, 160, 60)
+        image = cv2.GaussianBlur(sharp, (0, 0), 1.2) + rng.normal(0, 1, sharp.shape)
+        truth = np.zeros((HEIGHT, WIDTH), dtype=bool)
+        truth[PERSON] = True
+        mask = model.segment(np.clip(image, 0, 255).astype(np.uint8)).mask > 0
+        assert abs(np.count_nonzero(mask) / np.count_nonzero(truth) - 1) < 0.05
+
+    @given(st.floats(0.56, 0.97), st.integers(0, 3))
+    @settings(max_examples=12, deadline=None)
+    def test_a_cast_shadow_vanishes_and_the_person_stays(self, factor, seed):
+        rng = np.random.default_rng(seed)
+        model = learned(rng)
+        light = np.ones((HEIGHT, WIDTH, 1), dtype=np.float32)
+        light[60:80, 60:120] = factor
+        image = room(rng, noise=0) * cv2.GaussianBlur(light, (0, 0), 2)[..., None]
+        image += rng.normal(0, 1, image.shape)
+        image[PERSON] = (30, 160, 60)
+        truth = np.zeros((HEIGHT, WIDTH), dtype=bool)
+        truth[PERSON] = True
+        mask = model.segment(np.clip(np.rint(image), 0, 255).astype(np.uint8)).mask > 0
+        assert iou(mask, truth) > 0.97
+
+    def test_who_stands_still_is_not_absorbed(self):
+        rng = np.random.default_rng(2)
+        model = learned(rng, BackgroundConfig(learning_rate=0.05))
+        image = room(rng)
+        image[PERSON] = (30, 160, 60)
+        first = model.segment(image).foreground_fraction
+        for _ in range(150):
+            result = model.segment(image)
+        assert result.foreground_fraction == pytest.approx(first, rel=0.02)
+
+    def test_a_shadow_is_not_learned(self):
+        rng = np.random.default_rng(2)
+        model = learned(rng, BackgroundConfig(learning_rate=0.05))
+        shaded = room(rng)
+        shaded[20:60, 20:60] = shaded[20:60, 20:60] * 0.7
+        before = model.background
+        for _ in range(100):
+            model.segment(shaded)
+        assert np.abs(model.background[25:55, 25:55].astype(int) - before[25:55, 25:55]).max() <= 1
+
+    def test_a_slow_local_change_is_learned_unless_frozen(self):
+        rng = np.random.default_rng(3)
+        for frozen in (False, True):
+            model = learned(rng, BackgroundConfig(learning_rate=0.1))
+            model.freeze(frozen)
+            assert model.frozen is frozen
+            for step in range(120):
+                image = room(rng).astype(np.float32)
+                image[20:70, 20:90] += (0.25 * step, 0, -0.25 * step)  # a lamp's colour, 30 grey levels in the end
+                result = model.segment(np.clip(image, 0, 255).astype(np.uint8))
+            assert bool(result.mask.any()) is frozen
+
+    @pytest.mark.parametrize("light", [0.6, 1.3])
+    def test_light_that_drifts_is_no_foreground(self, light):
+        rng = np.random.default_rng(4)
+        model = learned(rng)
+        for t in np.linspace(0, 1, 40):
+            result = model.segment(room(rng, light=1 + t * (light - 1)))
+            assert not result.mask.any()
+        assert result.gain == pytest.approx((light,) * 3, rel=0.01)
+        image = room(rng, light=light)
+        image[PERSON] = (30, 160, 60)
+        truth = np.zeros((HEIGHT, WIDTH), dtype=bool)
+        truth[PERSON] = True
+        assert iou(model.segment(image).mask > 0, truth) > 0.97
+
+    def test_another_lamp_is_said_and_learned(self):
+        rng = np.random.default_rng(5)
+        model = learned(rng, BackgroundConfig(learning_frames=5))
+
+        def evening():  # light from the side, of another colour
+            slope = np.linspace(0.2, 1.6, WIDTH)[None, :, None] * (0.5, 0.9, 1.3)
+            return np.clip(room(rng) * slope, 0, 255).astype(np.uint8)
+
+        for n in range(PATIENCE + 5 - 1):
+            result = model.segment(evening())
+            assert result.learning
+            assert not result.mask.any()
+            assert result.light_jump is (n < PATIENCE)
+        image = evening()
+        image[PERSON] = (30, 250, 60)
+        result = model.segment(image)
+        assert not result.learning
+        assert 0.5 < result.foreground_fraction / (40 * 20 / (HEIGHT * WIDTH)) < 1.1
+
+    def test_a_flash_does_not_cost_the_background(self):
+        rng = np.random.default_rng(6)
+        model = learned(rng)
+        for _ in range(PATIENCE - 1):
+            assert model.segment(np.full((HEIGHT, WIDTH, 3), 255, dtype=np.uint8)).light_jump
+        result = model.segment(room(rng))
+        assert not result.learning
+        assert not result.mask.any()
+
+    def test_grey_images(self):
+        rng = np.random.default_rng(7)
+        for as_colour in (False, True):
+            model = BackgroundModel()
+
+            def grey(paint=None, as_colour=as_colour):
+                image = cv2.cvtColor(room(rng), cv2.COLOR_BGR2GRAY)
+                if paint is not None:
+                    image[PERSON] = paint
+                return cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if as_colour else image
+
+            for _ in range(20):
+                result = model.segment(grey())
+            assert not result.mask.any()
+            # 0.7 of the background would be a shadow in colour; grey images cannot tell, and keep it.
+            assert np.count_nonzero(model.segment(grey(85)).mask[PERSON]) > 0.95 * 800
+
+    def test_large_images_are_worked_on_smaller(self):
+        rng = np.random.default_rng(8)
+        shape = (240, 322)
+        model = learned(rng, BackgroundConfig(max_pixels=25_000), shape=shape)
+        image = room(rng, shape=shape)
+        image[60:160, 100:150] = (30, 160, 60)
+        truth = np.zeros(shape, dtype=bool)
+        truth[60:160, 100:150] = True
+        mask = model.segment(image).mask
+        assert mask.shape == shape
+        assert iou(mask > 0, truth) > 0.95
+
+    def test_the_same_images_give_the_same_masks(self):
+        def run():
+            rng = np.random.default_rng(9)
+            model = learned(rng)
+            out = []
+            for k in range(10):
+                image = room(rng, light=1 - 0.01 * k)
+                image[PERSON[0], 20 + 5 * k : 40 + 5 * k] = (30, 160, 60)
+                out.append(model.segment(image).mask)
+            return np.stack(out)
+
+        first = run()
+        assert first.any()
+        np.testing.assert_array_equal(first, run())
+
+
+class TestSeeds:
+    def test_one_picture_takes_the_noise_from_the_first_image(self):
+        rng = np.random.default_rng(10)
+        model = BackgroundModel()
+        model.seed(room(rng, noise=0))
+        assert not model.learning
+        for _ in range(5):
+            result = model.segment(room(rng, noise=6))
+            assert not result.mask.any()
+        image = room(rng, noise=6)
+        image[PERSON] = (30, 160, 60)
+        assert np.count_nonzero(model.segment(image).mask[PERSON]) > 0.95 * 800
+
+    def test_many_pictures(self):
+        rng = np.random.default_rng(11)
+        model = BackgroundModel()
+        model.seed([room(rng, noise=5) for _ in range(10)])
+        assert not model.segment(room(rng, noise=5)).mask.any()
+
+    def test_a_guess_from_a_recording_without_an_empty_room(self):
+        rng = np.random.default_rng(12)
+        frames = []
+        for k in range(20):
+            image = room(rng, light=1 - 0.005 * k)
+            image[30:90, 5 * k : 5 * k + 25] = (30, 160, 60)  # covers a pixel in 5 of 20 frames
+            frames.append(image)
+        estimate = estimate_background(frames)
+        assert np.abs(estimate.mean - room(rng, noise=0, light=0.95)).mean() < 1.5
+        model = BackgroundModel()
+        model.seed_estimate(estimate)
+        truth = np.zeros((HEIGHT, WIDTH), dtype=bool)
+        truth[30:90, 50:75] = True
+        assert iou(model.segment(frames[10]).mask > 0, truth) > 0.97
+
+    def test_a_guess_for_images_larger_than_the_working_size(self):
+        rng = np.random.default_rng(13)
+        frames = [room(rng) for _ in range(4)]
+        model = BackgroundModel(BackgroundConfig(max_pixels=10_000))
+        model.seed_estimate(estimate_background(frames))
+        assert not model.segment(room(rng)).mask.any()
+
+    def test_too_little_to_guess_from(self):
+        rng = np.random.default_rng(14)
+        with pytest.raises(InputError, match="at least 3 frames"):
+            estimate_background([room(rng)] * 2)
+        with pytest.raises(InputError, match="one size"):
+            estimate_background([room(rng), room(rng), room(rng, shape=(50, 50))])
+
+    def test_no_picture(self):
+        with pytest.raises(InputError, match="at least one background picture"):
+            BackgroundModel().seed([])
+
+
+class TestBadInput:
+    def test_another_size(self):
+        rng = np.random.default_rng(0)
+        model = learned(rng)
+        with pytest.raises(InputError, match=r"128x96 px.*got 64x48"):
+            model.segment(np.zeros((48, 64, 3), dtype=np.uint8))
+        model.recapture()
+        assert model.segment(np.zeros((48, 64, 3), dtype=np.uint8)).learning
+
+    @pytest.mark.parametrize(
+        "image", [np.zeros((96, 128, 3)), np.zeros((96, 128, 4), np.uint8), np.zeros((4, 4, 3), np.uint8), None]
+    )
+    def test_not_an_image(self, image):
+        with pytest.raises(InputError, match=r"expected an image"):
+            BackgroundModel().segment(image)
+
+    def test_impossible_parameters(self):
+        with pytest.raises(ConfigError, match="learning_frames"):
+            BackgroundModel(BackgroundConfig(learning_frames=0))
+
+    def test_parameters_change_live(self):
+        rng = np.random.default_rng(0)
+        model = learned(rng)
+        image = room(rng)
+        image[PERSON] = (30, 160, 60)
+        assert model.segment(image).mask.any()
+        model.config = dataclasses.replace(model.config, min_blob_px=100_000)
+        assert not model.segment(image).mask.any()
+
+
+@pytest.mark.parametrize("camera", [f"cam{i}" for i in range(8)])
+def test_a_rendered_walk(camera):
+    """Shadows on the floor, drifting light, JPEG noise: the whole chain against the true silhouettes."""
+    with np.load(WALK / "masks.npz") as archive:
+        truth = np.unpackbits(archive[camera], axis=2)[:, :, :640] > 0
+    model = BackgroundModel(BackgroundConfig(learning_frames=8))
+    scores = []
+    for i, is_person in enumerate(truth):
+        image = cv2.imread(str(WALK / "rgb" / camera / f"{i:04d}.jpg"))
+        result = model.segment(image)
+        assert result.learning is (i < 8)
+        if i >= 8:
+            scores.append(iou(result.mask > 0, is_person))
+    assert np.mean(scores) > 0.95
+    assert min(scores) > 0.93
