@@ -13,6 +13,7 @@ from limbloc_ros.recordings.open_source import background_pictures
 from limbloc_ros.recordings.videos import ImageFolder, Video, find_streams, read_picture
 
 WIDTH, HEIGHT = 64, 48
+DEFAULTS = {"a": BackgroundConfig(), "b": BackgroundConfig()}
 
 
 def make_rig(*names):
@@ -125,7 +126,7 @@ def test_different_frame_rates_are_refused(tmp_path):
     write_video(tmp_path / "a.avi", [1, 2], fps=25)
     write_video(tmp_path / "b.avi", [1, 2], fps=30)
     with pytest.raises(InputError, match=r"different frame rates \(a 25 Hz, b 30 Hz\)"):
-        FolderSource(tmp_path, make_rig("a", "b"), BackgroundConfig())
+        FolderSource(tmp_path, make_rig("a", "b"), DEFAULTS)
 
 
 @pytest.mark.parametrize(
@@ -144,7 +145,7 @@ def test_silhouettes_of_any_making(image, expected):
 def test_silhouettes_become_masks_and_a_lost_one_is_left_out(tmp_path):
     write_folder(tmp_path / "a", [(0, 255), (1, 255), (2, 0)])
     write_folder(tmp_path / "b", [(0, 0), (2, 255)])
-    source = FolderSource(tmp_path, make_rig("a", "b"), BackgroundConfig(), are_masks=True, fps=10)
+    source = FolderSource(tmp_path, make_rig("a", "b"), DEFAULTS, are_masks=True, fps=10)
     sets = list(source.mask_sets())
     assert [s.stamp_ns for s in sets] == [0, 100_000_000, 200_000_000]
     assert [sorted(s.masks) for s in sets] == [["a", "b"], ["a"], ["a", "b"]]
@@ -158,7 +159,7 @@ def test_silhouettes_become_masks_and_a_lost_one_is_left_out(tmp_path):
 def test_pictures_of_another_size_are_refused(tmp_path):
     (tmp_path / "a").mkdir()
     cv2.imwrite(str(tmp_path / "a" / "0.png"), np.zeros((10, 20), dtype=np.uint8))
-    source = FolderSource(tmp_path, make_rig("a"), BackgroundConfig(), are_masks=True)
+    source = FolderSource(tmp_path, make_rig("a"), DEFAULTS, are_masks=True)
     with pytest.raises(InputError, match=r"camera a, .*: expected 64x48 px as in the rig file, got 20x10"):
         list(source.mask_sets())
 
@@ -189,7 +190,7 @@ def square_found(mask, frame):
 
 def test_the_room_is_learned_from_the_first_frames(tmp_path):
     write_walk(tmp_path / "a", empty=6)
-    config = BackgroundConfig(learning_frames=6, min_blob_px=20)
+    config = {"a": BackgroundConfig(learning_frames=6, min_blob_px=20)}
     sets = list(FolderSource(tmp_path, make_rig("a"), config).mask_sets())
     assert [bool(s.reason) for s in sets] == [True] * 6 + [False] * 12
     assert sets[2].reason == "learning the background (3 of 6 frames)"
@@ -203,14 +204,14 @@ def test_the_room_is_taken_from_a_picture(tmp_path):
     cv2.imwrite(str(tmp_path / "empty" / "a.png"), wall)
     rig = make_rig("a")
     pictures = background_pictures(tmp_path / "empty", rig)
-    config = BackgroundConfig(min_blob_px=20)
+    config = {"a": BackgroundConfig(min_blob_px=20)}
     sets = list(FolderSource(tmp_path / "video", rig, config, pictures).mask_sets())
     assert all(square_found(s.masks["a"], i) for i, s in enumerate(sets))
 
 
 def test_the_room_is_guessed_from_a_recording_with_somebody_in_it(tmp_path):
     write_walk(tmp_path / "a")
-    config = BackgroundConfig(min_blob_px=20)
+    config = {"a": BackgroundConfig(min_blob_px=20)}
     sets = list(FolderSource(tmp_path, make_rig("a"), config, estimate=True).mask_sets())
     assert all(square_found(s.masks["a"], i) for i, s in enumerate(sets))
 

@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from limbloc_ros.core.background import estimate_background
 from limbloc_ros.core.camera import Rig
-from limbloc_ros.core.config import BackgroundConfig
 from limbloc_ros.core.errors import InputError
-from limbloc_ros.recordings.sources import MaskSet, Segmenter, check_size, file_identity, rig_identity
+from limbloc_ros.recordings.sources import Backgrounds, MaskSet, Segmenter, check_size, file_identity, rig_identity
 from limbloc_ros.recordings.videos import Stream, find_streams
 
 Pixels = NDArray[np.uint8]
@@ -32,7 +31,7 @@ class FolderSource:
     Args:
         folder: see `videos.find_streams`.
         rig: the cameras.
-        config: segmentation.
+        config: segmentation of each camera.
         pictures: camera name -> picture of the empty room; without, the first frames must show it.
         estimate: guess the empty room from the recording.
         are_masks: the frames are silhouettes already.
@@ -46,7 +45,7 @@ class FolderSource:
         self,
         folder: Path,
         rig: Rig,
-        config: BackgroundConfig,
+        config: Backgrounds,
         pictures: Mapping[str, Pixels] | None = None,
         *,
         estimate: bool = False,

@@ -41,9 +41,10 @@ from limbloc_ros.recordings.sources import Source
 
 @dataclass(frozen=True)
 class OfflineConfig:
-    """Every parameter of an offline run, in the sections of a `--config` YAML."""
+    """Every parameter of an offline run; `background_of` replaces `background` for single cameras."""
 
     background: BackgroundConfig = field(default_factory=BackgroundConfig)
+    background_of: dict[str, BackgroundConfig] = field(default_factory=dict)
     sync: SyncConfig = field(default_factory=SyncConfig)
     hull: HullConfig = field(default_factory=HullConfig)
     fit: FitConfig = field(default_factory=FitConfig)

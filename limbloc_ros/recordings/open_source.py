@@ -54,6 +54,9 @@ def open_source(
         return CaseSource(load_case(path, rig))
     if rig is None:
         raise InputError(f"{path} needs --rig: a rig YAML or calib.json with the calibrated cameras")
+    for name in config.background_of:
+        rig.camera(name)
+    backgrounds = {name: config.background_of.get(name, config.background) for name in rig.names}
     pictures: dict[str, Pixels] = {}
     if background is not None and background != ESTIMATE:
         pictures = background_pictures(Path(background), rig)
@@ -62,16 +65,14 @@ def open_source(
             raise InputError(
                 f"{path} is a bag, which says itself what it holds: leave --masks, --fps and estimate away"
             )
-        return BagSource(path, rig, config.background, config.sync, config.hull.min_cameras, pictures)
+        return BagSource(path, rig, backgrounds, config.sync, config.hull.min_cameras, pictures)
     if path.is_file():
         raise InputError(
             f"{path}: expected a bag (.mcap, .db3) or a folder; give the folder that holds all cameras' videos"
         )
     if masks and background:
         raise InputError("--masks: silhouettes need no --background; leave one of them away")
-    return FolderSource(
-        path, rig, config.background, pictures, estimate=background == ESTIMATE, are_masks=masks, fps=fps
-    )
+    return FolderSource(path, rig, backgrounds, pictures, estimate=background == ESTIMATE, are_masks=masks, fps=fps)
 
 
 def background_pictures(folder: Path, rig: Rig) -> dict[str, Pixels]:

@@ -27,6 +27,9 @@ from limbloc_ros.recordings.cases import Case
 
 Pixels = NDArray[np.uint8]
 
+#: Segmentation parameters of every camera by name.
+Backgrounds = Mapping[str, BackgroundConfig]
+
 
 @dataclass(frozen=True)
 class MaskSet:
@@ -94,7 +97,7 @@ class BagSource:
     """Masks or camera images in a rosbag2 recording."""
 
     def __init__(
-        self, path: Path, rig: Rig, background: BackgroundConfig, sync: SyncConfig, min_cameras: int,
+        self, path: Path, rig: Rig, background: Backgrounds, sync: SyncConfig, min_cameras: int,
         pictures: Mapping[str, Pixels] | None = None,
     ) -> None:  # fmt: skip
         self.rig = rig
@@ -156,17 +159,16 @@ class Segmenter:
 
     Args:
         rig: the cameras.
-        config: the same for all.
+        config: segmentation of each camera.
         pictures: camera name -> picture of the empty room; cameras without one learn from their first frames.
 
     Attributes:
         models: camera name -> its background model.
     """
 
-    def __init__(self, rig: Rig, config: BackgroundConfig, pictures: Mapping[str, Pixels]) -> None:
+    def __init__(self, rig: Rig, config: Backgrounds, pictures: Mapping[str, Pixels]) -> None:
         self._rig = rig
-        self.models = {name: BackgroundModel(config) for name in rig.names}
-        self._config = config
+        self.models = {name: BackgroundModel(config[name]) for name in rig.names}
         for name, picture in pictures.items():
             check_size(picture, rig, name, "its background picture")
             self.models[name].seed(picture)
@@ -183,8 +185,9 @@ class Segmenter:
             results[name] = self.models[name].segment(image)
         reason = ""
         if all(result.learning for result in results.values()):
-            learned = min(result.frames_learned for result in results.values())
-            reason = f"learning the background ({learned} of {self._config.learning_frames} frames)"
+            name, least = min(results.items(), key=lambda item: item[1].frames_learned)
+            wanted = self.models[name].config.learning_frames
+            reason = f"learning the background ({least.frames_learned} of {wanted} frames)"
         return {name: result.mask for name, result in results.items()}, reason
 
 
