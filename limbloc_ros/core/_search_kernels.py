@@ -305,7 +305,7 @@ def tube_score(
         e += ra + t * (rb - ra)
         if e > 0.0:
             e *= 2.0
-        e = min(max(e, -clip), 3.0 * clip)
+        e = min(max(e, -clip), 2.0 * clip)
         total += e * e
     return total / (steps * clip * clip)
 
@@ -381,7 +381,7 @@ def search_limb(
         s = tube_score(
             sdf, origin, voxel, base[0], base[1], base[2], x, y, z, tube_radii[0], tube_radii[1], 6, clip, skip
         )
-        if s > 3.0:
+        if s > 3.2:
             continue
         s += explained_weight * explained_fraction(base[0], base[1], base[2], x, y, z, parts, spheres, radii, 0.4)
         middle[count, 0] = x
@@ -419,7 +419,7 @@ def search_limb(
             y = ey + lengths[1] * dy
             z = ez + lengths[1] * dz
             s2 = tube_score(sdf, origin, voxel, ex, ey, ez, x, y, z, tube_radii[1], tube_radii[2], 6, clip, 0.0)
-            if s2 > 3.0:
+            if s2 > 3.2:
                 continue
             s2 += explained_weight * explained_fraction(ex, ey, ez, x, y, z, parts, spheres, radii, 0.0)
             # the hand or heel goes on a little beyond the end

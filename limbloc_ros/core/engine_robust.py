@@ -56,16 +56,16 @@ def refine(state: FigureState, evidence: Evidence, weights: Weights, iterations:
 
 
 _LIMB_BASES = ("upper_arm", "forearm", "hand")
-_BODY_PARTS = np.array([p for p, name in enumerate(figure.PART_NAMES) if not name.startswith(_LIMB_BASES)])
+BODY_PARTS = np.array([p for p, name in enumerate(figure.PART_NAMES) if not name.startswith(_LIMB_BASES)])
 
 
 def complete_limbs(state: FigureState, hull: Hull, medial: Medial, samples: Array, pairs: int) -> list[FigureState]:
     """Give a torso the legs and arms that together explain most of the hull."""
     placed = figure.place(state)
     explained = figure.kernels.flesh_distance(
-        samples, figure.PART_SPHERES[search._TRUNK_PARTS], placed.spheres, placed.radii
+        samples, figure.PART_SPHERES[search.TRUNK_PARTS], placed.spheres, placed.radii
     )[0] < 0.04
-    legs = [search.limb_candidates(hull, medial, placed, LEG, s, search._TRUNK_PARTS[:0], 30) for s in "LR"]
+    legs = [search.limb_candidates(hull, medial, placed, LEG, s, search.UPPER_TRUNK_PARTS, 40) for s in "LR"]
     leg_pairs = search.limb_pairs(legs[0], legs[1], samples, explained, 0.02, 1)
     if leg_pairs:
         a, b, _ = leg_pairs[0]
@@ -78,9 +78,9 @@ def complete_arms(state: FigureState, hull: Hull, medial: Medial, samples: Array
     """Give a figure with legs the best pairs of arms."""
     placed = figure.place(state)
     explained = figure.kernels.flesh_distance(
-        samples, figure.PART_SPHERES[_BODY_PARTS], placed.spheres, placed.radii
+        samples, figure.PART_SPHERES[BODY_PARTS], placed.spheres, placed.radii
     )[0] < 0.035
-    arms = [search.limb_candidates(hull, medial, placed, ARM, s, _BODY_PARTS, 40) for s in "LR"]
+    arms = [search.limb_candidates(hull, medial, placed, ARM, s, BODY_PARTS, 40) for s in "LR"]
     out = []
     for a, b, _ in search.limb_pairs(arms[0], arms[1], samples, explained, 0.02, pairs):
         armed = search.with_limb(state, placed, ARM, "L", arms[0].found[a])
@@ -97,7 +97,9 @@ class Fit:
     runner_up: float
 
 
-def fit_from_scratch(hull: Hull, surface: Surface, seed: int, weights: Weights, effort: Effort) -> Fit | None:
+def fit_from_scratch(
+    hull: Hull, surface: Surface, seed: int, weights: Weights = Weights(), effort: Effort = Effort()
+) -> Fit | None:
     """Fit one frame alone: torso hypotheses, both facings, limbs, refinement, arm repair."""
     rng = np.random.default_rng(seed)
     medial = Medial.of(hull)
@@ -120,3 +122,39 @@ def fit_from_scratch(hull: Hull, surface: Surface, seed: int, weights: Weights, 
     best = [refine(r.state, full, weights, effort.iterations) for r in finalists[:2]]
     best.sort(key=lambda r: r.system.cost)
     return Fit(best[0].state, best[0].system, best[-1].system.cost)
+
+
+class Tracker:
+    """Fits frame after frame, each from the last; starts anew when there is no last one or the fit went wrong."""
+
+    #: A cost this much above the usual one is no longer believed.
+    DOUBT = 1.35
+
+    def __init__(self, seed: int, weights: Weights = Weights(), effort: Effort = Effort()) -> None:
+        self._seed, self._weights, self._effort = seed, weights, effort
+        self._last: FigureState | None = None
+        self._usual_cost = 0.0
+
+    def reset(self) -> None:
+        """Forget the last frame."""
+        self._last = None
+
+    def follow(self, hull: Hull, surface: Surface) -> Fit | None:
+        """Fit the next frame."""
+        fit: Fit | None = None
+        if self._last is not None:
+            evidence = gather_evidence(hull, surface, 600, np.random.default_rng(self._seed))
+            result = refine(self._last, evidence, self._weights, 10)
+            fit = Fit(result.state, result.system, np.inf)
+        if fit is None or fit.system.cost > self.DOUBT * self._usual_cost:
+            scratch = fit_from_scratch(hull, surface, self._seed, self._weights, self._effort)
+            if scratch is not None and (fit is None or scratch.system.cost < 0.9 * fit.system.cost):
+                fit = scratch
+        if fit is None:
+            self._last = None
+            return None
+        # the usual cost follows slowly, so one odd frame is judged by the calm ones before it
+        fresh = self._last is None or self._usual_cost == 0.0
+        self._usual_cost = fit.system.cost if fresh else 0.9 * self._usual_cost + 0.1 * fit.system.cost
+        self._last = fit.state
+        return fit

@@ -23,6 +23,13 @@ from limbloc_ros.core.silhouettes import Silhouettes, measure_silhouettes, pack_
 
 #: Coarsest blocks of the hierarchy, in voxels; halved until LEAF.
 ROOT, LEAF = 16, 4
+#: A silhouette's rim of this width is not asked whether the hull explains it: voxels are coarser than pixels.
+INNER_PX = 1.5
+#: Fraction of unexplained foreground from which on the cameras contradict each other as much as we distinguish.
+DOUBTED_FRACTION = 0.02
+
+#: Lattice indices [V, 3], largest and second largest camera distance [V] m, camera of the largest [V].
+Voxels = tuple[NDArray[np.int32], NDArray[np.float32], NDArray[np.float32], NDArray[np.int16]]
 
 
 @dataclass(frozen=True)
@@ -101,7 +108,7 @@ def lattice_bounds(rig: Rig, voxel_m: float) -> tuple[NDArray[np.int64], NDArray
 
 def evaluate(
     silhouettes: Silhouettes, rig: Rig, voxel_m: float, band_m: float, keep_second: bool = True, min_seen: int = 2
-) -> tuple[NDArray[np.int32], NDArray[np.float32], NDArray[np.float32], NDArray[np.int16]]:
+) -> Voxels:
     """Signed distances of every voxel near the hull, by halving blocks that may hold some of it.
 
     Exact: the same voxels and values as the evaluation of every voxel of the volume.
@@ -144,13 +151,28 @@ def reject_dead_cameras(silhouettes: Silhouettes, rig: Rig, config: HullConfig) 
     return silhouettes
 
 
+def cover_silhouettes(silhouettes: Silhouettes, voxels: Voxels, config: HullConfig) -> NDArray[np.uint8]:
+    """Which pixels the hull's voxels project to; uint8 in the layout of `silhouettes.field`."""
+    indices, first, _, _ = voxels
+    covered = np.zeros(silhouettes.field.size, np.uint8)
+    centres = (indices[first < 0] + 0.5) * config.voxel_m
+    kernels.cover(centres, 0.875 * config.voxel_m, silhouettes.cameras, silhouettes.boxes, covered)
+    return covered
+
+
+def unexplained_fraction(silhouettes: Silhouettes, covered: NDArray[np.uint8]) -> float:
+    """Mean over the cameras of the fraction of foreground (but its rim) that no voxel covers: 0 if all agree."""
+    fractions = []
+    for c in range(len(silhouettes.names)):
+        solid = silhouettes.piece(c) < -INNER_PX
+        _, _, width, height, offset = silhouettes.boxes[c]
+        bare = covered[offset : offset + width * height].reshape(height, width) == 0
+        fractions.append(float((solid & bare).sum()) / max(int(solid.sum()), 1))
+    return float(np.mean(fractions))
+
+
 def mend_silhouettes(
-    silhouettes: Silhouettes,
-    indices: NDArray[np.int32],
-    first: NDArray[np.float32],
-    second: NDArray[np.float32],
-    who: NDArray[np.int16],
-    config: HullConfig,
+    silhouettes: Silhouettes, covered: NDArray[np.uint8], voxels: Voxels, config: HullConfig
 ) -> Silhouettes:
     """Give back to a silhouette what it lost, on the evidence of all other cameras.
 
@@ -161,12 +183,14 @@ def mend_silhouettes(
 
     Args:
         silhouettes: as measured.
-        indices, first, second, who: what `evaluate` returned for them.
+        covered: what `cover_silhouettes` found.
+        voxels: what `evaluate` found.
         config: `repair_depth_m`, voxel size.
 
     Returns:
         silhouettes with the mended ones measured anew, or the very same object when nothing was to mend.
     """
+    indices, first, second, who = voxels
     if len(silhouettes.names) < 3:
         return silhouettes
     half = 0.5 * config.voxel_m
@@ -174,10 +198,8 @@ def mend_silhouettes(
     if not denied.any():
         return silhouettes
     table = (silhouettes.cameras, silhouettes.boxes)
-    covered = np.zeros(silhouettes.field.size, np.uint8)
-    kernels.cover((indices[first < 0] + 0.5) * config.voxel_m, 1.75 * half, *table, covered)
     points, deniers, depths = (indices[denied] + 0.5) * config.voxel_m, who[denied], -second[denied]
-    unexplained = kernels.count_unexplained(points, deniers, *table, silhouettes.field, covered, 1.5)
+    unexplained = kernels.count_unexplained(points, deniers, *table, silhouettes.field, covered, INNER_PX)
     deep = depths > (config.repair_depth_m if len(silhouettes.names) >= 6 else 2 * config.repair_depth_m)
     give_back = (unexplained >= 2) | deep
     changes: dict[int, NDArray[np.uint8]] = {}
@@ -199,10 +221,18 @@ def carve_silhouettes(silhouettes: Silhouettes, rig: Rig, config: HullConfig) ->
     silhouettes = reject_dead_cameras(silhouettes, rig, config)
     min_seen = min(config.min_cameras, len(silhouettes.names))
     voxels = evaluate(silhouettes, rig, config.voxel_m, config.band_m, min_seen=min_seen)
-    mended = mend_silhouettes(silhouettes, *voxels, config)
+    covered = cover_silhouettes(silhouettes, voxels, config)
+    contradiction = unexplained_fraction(silhouettes, covered)
+    mended = mend_silhouettes(silhouettes, covered, voxels, config)
     if mended is not silhouettes:
-        voxels = evaluate(mended, rig, config.voxel_m, config.band_m, keep_second=False, min_seen=min_seen)
-    indices, distance = voxels[:2]
+        voxels = evaluate(mended, rig, config.voxel_m, config.band_m, min_seen=min_seen)
+    indices, first, second, _ = voxels
+    # Ragged masks bite a little from every side. The more the cameras contradict each other, the less may a single
+    # one decide; with few cameras two vetoes would leave far too much.
+    doubt = 0.0
+    if len(silhouettes.names) >= 6:
+        doubt = min(1.0, contradiction / DOUBTED_FRACTION) * config.shared_veto
+    distance = (first + np.float32(doubt) * (second - first)).astype(np.float32)
     near = distance < np.float32(config.band_m)
     if not (distance[near] < 0).any():
         return NoPerson("the silhouettes have no volume in common: is anybody in the carve volume?")

@@ -3,44 +3,115 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
-from limbloc_ros.core.camera import Rig
-from limbloc_ros.core.config import FitConfig, HullConfig
+from limbloc_ros.core import engine_paper, engine_robust
+from limbloc_ros.core.camera import Camera, Rig
+from limbloc_ros.core.config import FitConfig, HullConfig, validated
+from limbloc_ros.core.confidence import describe_pose
 from limbloc_ros.core.errors import NoPerson
-from limbloc_ros.core.hull import Hull
+from limbloc_ros.core.hull import Hull, carve_silhouettes
 from limbloc_ros.core.pose import Pose
+from limbloc_ros.core.silhouettes import measure_silhouettes, pack_cameras
+from limbloc_ros.core.surface import extract_surface
 
 
 class Carver:
     """The carving half: masks of one instant -> hull. Holds what only depends on the rig."""
 
     def __init__(self, rig: Rig, config: HullConfig | None = None) -> None:
-        raise NotImplementedError
+        self.rig = rig
+        self.config = validated(config or HullConfig())
+        self._packed = pack_cameras(rig)
 
     def carve(self, masks: Mapping[str, NDArray[np.uint8]]) -> Hull | NoPerson:
-        """Carve one frame; masks by camera name, uint8 [height, width], non-zero = foreground."""
-        raise NotImplementedError
+        """Carve one frame.
+
+        Args:
+            masks: camera name -> uint8 [height, width], non-zero = foreground; cameras may be missing.
+
+        Raises:
+            InputError: a mask has not its camera's size, or its camera is unknown.
+        """
+        silhouettes = measure_silhouettes(masks, self.rig, self._packed, self.config)
+        return carve_silhouettes(silhouettes, self.rig, self.config)
 
 
 class PoseEstimator:
-    """The fitting half: hull -> pose. Frame-independent unless `config.temporal`, then it keeps the last pose."""
+    """The fitting half: hull -> pose.
+
+    Every frame is fitted alone (paper section 4) unless `config.temporal`: then the last frame's figure is the first
+    guess, and a fit that is clearly worse than the last ones is done again from scratch.
+    """
 
     def __init__(self, config: FitConfig | None = None) -> None:
-        raise NotImplementedError
+        self.config = validated(config or FitConfig())
+        self._tracker = engine_robust.Tracker(self.config.seed)
 
     def estimate(self, hull: Hull) -> Pose | NoPerson:
         """Fit the figure to one hull."""
-        raise NotImplementedError
+        clock = _Stopwatch()
+        if self.config.engine == "paper":
+            branch, _ = engine_paper.fit_state(hull)
+            clock.lap("fit")
+            return describe_pose(branch.state, hull, None, clock.stage_ms)
+        surface = extract_surface(hull)
+        clock.lap("surface")
+        if self.config.temporal:
+            fit = self._tracker.follow(hull, surface)
+        else:
+            fit = engine_robust.fit_from_scratch(hull, surface, self.config.seed)
+        clock.lap("fit")
+        if fit is None:
+            return NoPerson("the hull holds nothing that a torso fits into")
+        return describe_pose(fit.state, hull, fit.system, clock.stage_ms)
 
     def reset(self) -> None:
         """Forget the last frame (a new recording, a jump back in time)."""
-        raise NotImplementedError
+        self._tracker.reset()
 
     @staticmethod
     def warm_up() -> None:
         """Compile or load every kernel, so that the first frame is not slow."""
-        raise NotImplementedError
+        hull = Carver(*_warm_up_room()).carve(_warm_up_masks())
+        assert isinstance(hull, Hull)
+        for temporal in (False, True):
+            estimator = PoseEstimator(FitConfig(temporal=temporal))
+            estimator.estimate(hull)
+            estimator.estimate(hull)
+
+
+class _Stopwatch:
+    """Process time of the stages, ms."""
+
+    def __init__(self) -> None:
+        self.stage_ms: dict[str, float] = {}
+        self._last = time.process_time()
+
+    def lap(self, stage: str) -> None:
+        now = time.process_time()
+        self.stage_ms[stage] = 1e3 * (now - self._last)
+        self._last = now
+
+
+def _warm_up_room() -> tuple[Rig, HullConfig]:
+    K = np.array([[120.0, 0.0, 79.5], [0.0, 120.0, 79.5], [0.0, 0.0, 1.0]])
+    cameras = []
+    for i, (x, y) in enumerate(((3.0, 0.0), (0.0, 3.0), (-2.1, -2.1))):
+        forward = -np.array([x, y, 0.0]) / np.hypot(x, y)
+        down = np.array([0.0, 0.0, -1.0])
+        T = np.eye(4)
+        T[:3, :3] = np.stack([np.cross(down, forward), down, forward], axis=1)
+        T[:3, 3] = x, y, 1.0
+        cameras.append(Camera(f"warm{i}", 160, 160, K, T))
+    return Rig(tuple(cameras), np.array([-1.0, -1.0, 0.0]), np.array([1.0, 1.0, 2.0])), HullConfig(voxel_m=0.03)
+
+
+def _warm_up_masks() -> dict[str, NDArray[np.uint8]]:
+    mask = np.zeros((160, 160), np.uint8)
+    mask[50:66, 73:87] = mask[66:110, 66:94] = mask[110:150, 68:78] = mask[110:150, 82:92] = 255
+    return {f"warm{i}": mask for i in range(3)}

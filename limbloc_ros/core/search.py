@@ -104,9 +104,9 @@ class Medial:
 
     @staticmethod
     def of(hull: Hull) -> Medial:
-        """Medial voxels at least 0.6 voxels deep."""
+        """Medial voxels, down to thin limbs of ragged masks (0.15 voxels deep)."""
         sdf = hull.sdf
-        return Medial(kernels.medial_ridge(sdf, hull.origin_m, hull.voxel_m, 0.6 * hull.voxel_m, 0.65))
+        return Medial(kernels.medial_ridge(sdf, hull.origin_m, hull.voxel_m, 0.15 * hull.voxel_m, 0.65))
 
 
 def torso_hypotheses(hull: Hull, medial: Medial, rng: np.random.Generator, keep: int = 6) -> list[tuple[FigureState, float]]:
@@ -209,10 +209,15 @@ class LimbKind:
 
 
 ARM = LimbKind(("upper_arm", "forearm", "hand"), ("deltoid", "elbow", "wrist"), "tips", 0.3, 1.5)
-LEG = LimbKind(("thigh", "shin", "foot"), ("thigh_top", "knee", "ankle"), "heel", 0.3, 0.5)
+LEG = LimbKind(("thigh", "shin", "foot"), ("thigh_top", "knee", "ankle"), "heel", 0.3, 1.5)
 
-_TRUNK_PARTS = np.array(
+TRUNK_PARTS = np.array(
     [p for p, name in enumerate(figure.PART_NAMES) if name in ("pelvis", "belly", "abdomen", "thorax", "chest", "head", "neck")]
+)
+
+#: Parts that a leg does not run through.
+UPPER_TRUNK_PARTS = np.array(
+    [p for p, name in enumerate(figure.PART_NAMES) if name in ("belly", "abdomen", "thorax", "chest", "head", "neck")]
 )
 
 
