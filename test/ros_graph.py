@@ -33,13 +33,15 @@ class Graph:
         gc.collect()  # nodes whose constructor failed in an earlier test are still on the network until then
         self.context = Context()
         rclpy.init(context=self.context, domain_id=DOMAIN)
+        self.executor = node_main.make_executor(self.context)
         self.nodes: list[Node] = []
         self.tester = self.add(lambda **options: Node("tester", **options))
 
     def close(self) -> None:
         """Destroy all nodes and shut the context down."""
-        for node in self.nodes:
-            node.destroy_node()
+        for node in list(self.nodes):
+            self.remove(node)
+        self.executor.shutdown()
         rclpy.shutdown(context=self.context)
 
     def add(self, make: Callable[..., Node], _name: str = "", **parameters: Any) -> Any:
@@ -48,11 +50,13 @@ class Graph:
         names = {"node_name": _name} if _name else {}
         node = make(context=self.context, parameter_overrides=overrides, **names)
         self.nodes.append(node)
+        self.executor.add_node(node)
         return node
 
     def remove(self, node: Node) -> None:
         """Take a node out of the graph, as if its process had died."""
         self.nodes.remove(node)
+        self.executor.remove_node(node)
         node.destroy_node()
 
     def collect(self, kind: Any, topic: str, qos: Any = topics.STREAM_QOS) -> list[Any]:
@@ -81,11 +85,13 @@ class Graph:
 
     def until(self, condition: Callable[[], bool], timeout_s: float = TIMEOUT_S) -> None:
         """Spin all nodes until the condition holds; fails after a while."""
-        assert node_main.spin(self.nodes, self.context, condition, timeout_s), "the condition did not come true in time"
+        assert node_main.run(self.executor, self.context, condition, timeout_s), (
+            "the condition did not come true in time"
+        )
 
     def spin(self, seconds: float) -> None:
         """Spin all nodes for some time."""
-        node_main.spin(self.nodes, self.context, lambda: False, seconds)
+        node_main.run(self.executor, self.context, None, seconds)
 
 
 class Diagnostics:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import sys
+import time
 import types
 from array import array
 from collections.abc import Iterator
@@ -190,6 +191,30 @@ def test_a_looped_bag_goes_on_after_the_jump_back(graph: Graph, rig: Rig, rig_fi
     for n in (50, 51, 0, 1):
         assert cameras.hull(person, n) is not None
     graph.until(lambda: cameras.diagnostics.value("carving: hull", "jumps_back_in_time") == "1")
+
+
+def test_a_slow_machine_skips_whole_sets_and_carves_the_newest(
+    graph: Graph, rig: Rig, rig_file: str, person: Masks
+) -> None:
+    node = graph.add(CarvingNode, rig_file=rig_file)
+    cameras = Cameras(graph, rig.names)
+    fast, seen = node.carver.carve, []
+
+    def slow(masks: Masks) -> Hull | NoPerson:
+        seen.append(tuple(masks))
+        time.sleep(0.3)
+        return fast(masks)
+
+    node.carver.carve = slow
+    cameras.send(person, 0)
+    graph.until(lambda: len(seen) == 1)
+    for n in range(1, 9):
+        cameras.send(person, n)
+    graph.until(lambda: len(cameras.hulls) > 0 and stamp_ns(cameras.hulls[-1].header) == T0_NS + 8 * FRAME_NS)
+    assert set(seen) == {rig.names}  # no set lacks a camera
+    carved = len(cameras.hulls)
+    assert carved < 9
+    graph.until(lambda: cameras.diagnostics.value("carving: hull", "sets_skipped") == str(9 - carved))
 
 
 def test_some_cameras_of_the_rig(graph: Graph, rig: Rig, rig_file: str, person: Masks) -> None:

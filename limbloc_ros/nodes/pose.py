@@ -100,6 +100,7 @@ class PoseNode(Node):
         """The figure to look at always, numbers to act on only when they are reliable."""
         if isinstance(outcome, NoPerson):
             self.joints.publish(messages.joints_to_message(None, header))
+            self.body.publish_nobody(header)
             self.markers.publish(messages.no_markers(header))
             return
         if outcome.reliable or self.settings.publish_unreliable:
@@ -108,6 +109,7 @@ class PoseNode(Node):
             self.body.publish(outcome, header, self.settings.urdf_tolerance_m, self.settings.urdf_period_s)
         else:
             self.joints.publish(messages.joints_to_message(None, header))
+            self.body.publish_nobody(header)
         if self.markers.get_subscription_count():
             self.markers.publish(messages.figure_to_markers(outcome, header))
 

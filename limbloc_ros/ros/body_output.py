@@ -1,9 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A person as ROS4HRI wants it (REP-155): joint_states, a URDF with the fitted lengths, and TF."""
+"""A person as ROS4HRI wants it (REP-155): joint_states, a URDF with the fitted lengths, the list of ids, and TF.
+
+`roi`, `cropped` and `skeleton2d` belong to one camera's image and have no meaning for many: they are left out.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +37,9 @@ class BodyOutput:
         self._publish_tf = publish_tf
         self._states = node.create_publisher(JointState, topics.body_joint_states(body_id), topics.STREAM_QOS)
         self._urdf = node.create_publisher(String, topics.body_urdf(body_id), topics.LATCHED_QOS)
+        self._ids_list = import_ids_list()
+        if self._ids_list is not None:
+            self._tracked = node.create_publisher(self._ids_list, topics.BODIES_TRACKED, topics.STREAM_QOS)
         self._transforms = TransformOutput(node) if publish_tf != "none" else None
         self._description = ""
         self._sizes: Mapping[str, float] = {}
@@ -50,6 +57,11 @@ class BodyOutput:
         """Forget the last frame (a jump back in time)."""
         self._angles, self._described_ns = None, 0
 
+    def publish_nobody(self, header: Header) -> None:
+        """Nobody is tracked at this instant."""
+        if self._ids_list is not None:
+            self._tracked.publish(self._ids_list(header=header, ids=[]))
+
     def publish(self, pose: Pose, header: Header, urdf_tolerance_m: float, urdf_period_s: float) -> None:
         """Joint states and transforms of one frame, and the URDF when the sizes have changed notably."""
         stamp = stamp_ns(header)
@@ -58,6 +70,8 @@ class BodyOutput:
         if not self._description or (changed > urdf_tolerance_m and waited):
             self._description, self._sizes, self._described_ns = body_urdf(pose, self._id), dict(pose.sizes), stamp
             self._urdf.publish(String(data=self._description))
+        if self._ids_list is not None:
+            self._tracked.publish(self._ids_list(header=header, ids=[self._id]))
         self._angles = ros4hri(pose, self._angles)
         states = angles_to_message(self._angles, header, f"_{self._id}")
         self._states.publish(states)
@@ -68,6 +82,15 @@ class BodyOutput:
                     self._description, dict(zip(states.name, states.position, strict=True)), header
                 )
             self._transforms.send(frames)
+
+
+def import_ids_list() -> Any | None:
+    """The message hri_msgs/IdsList, or None where there is none: it comes with an apt ROS 2 only."""
+    try:
+        from hri_msgs.msg import IdsList
+    except ImportError:
+        return None
+    return IdsList
 
 
 def body_pose(pose: Pose) -> NDArray[np.float64]:

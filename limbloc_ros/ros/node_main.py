@@ -33,7 +33,9 @@ def spin(
     until: Callable[[], bool] | None = None,
     timeout_s: float | None = None,
 ) -> bool:
-    """Run the nodes' callbacks in this thread until the context is shut down (Ctrl-C, SIGTERM).
+    """Run the nodes' callbacks in this thread until the context is shut down.
+
+    Once per node: a message whose event waits in an executor that ends is not announced to the next one.
 
     Args:
         nodes: all of the same context.
@@ -44,24 +46,34 @@ def spin(
     Returns:
         whether `until` became True.
     """
-    # The EventsExecutor's own spin() ignores signals and can hang at shutdown, so the loop is ours.
     executor = make_executor(context)
-    deadline = None if timeout_s is None else time.monotonic() + timeout_s
     for node in nodes:
         executor.add_node(node)
     try:
-        while rclpy.ok(context=context):
-            if until is not None and until():
-                return True
-            if deadline is not None and time.monotonic() > deadline:
-                return False
-            executor.spin_once(timeout_sec=0.02)
+        return run(executor, context, until, timeout_s)
     except (KeyboardInterrupt, ExternalShutdownException):
-        pass
+        return False
     finally:
         for node in nodes:
             executor.remove_node(node)
         executor.shutdown()
+
+
+def run(
+    executor: Executor,
+    context: Context | None = None,
+    until: Callable[[], bool] | None = None,
+    timeout_s: float | None = None,
+) -> bool:
+    """The loop of `spin` on an executor that already has its nodes."""
+    # The EventsExecutor's own spin() ignores signals and can hang at shutdown, so the loop is ours.
+    deadline = None if timeout_s is None else time.monotonic() + timeout_s
+    while rclpy.ok(context=context):
+        if until is not None and until():
+            return True
+        if deadline is not None and time.monotonic() > deadline:
+            return False
+        executor.spin_once(timeout_sec=0.02)
     return False
 
 

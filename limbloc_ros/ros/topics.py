@@ -61,6 +61,9 @@ JOINT_ANGLES = "joint_angles"  # sensor_msgs/JointState, the full native set
 DIAGNOSTICS = "/diagnostics"  # diagnostic_msgs/DiagnosticArray
 
 
+BODIES_TRACKED = "humans/bodies/tracked"  # hri_msgs/IdsList, where hri_msgs is installed
+
+
 def body_joint_states(body_id: str) -> str:
     """sensor_msgs/JointState of a person with the ROS4HRI joint names (REP-155)."""
     return f"humans/bodies/{body_id}/joint_states"
