@@ -98,9 +98,8 @@ def _run_live(args: argparse.Namespace, out: Path) -> None:
 
     from limbloc_ros.commands._live_table import LiveTable
 
-    print(
-        f"{args.cameras} cameras at {args.rate:g} Hz, {len(plans)} processes, ROS_DOMAIN_ID {os.environ['ROS_DOMAIN_ID']}"
-    )
+    domain = os.environ["ROS_DOMAIN_ID"]
+    print(f"{args.cameras} cameras at {args.rate:g} Hz, {len(plans)} processes, ROS_DOMAIN_ID {domain}")
     print("the room is empty at first, while the background is learned; Ctrl-C ends the demo early\n", flush=True)
     log = (out / "graph.log").open("w", encoding="utf-8")
     with log, LiveTable() as table:
