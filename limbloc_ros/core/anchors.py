@@ -9,7 +9,7 @@ is no longer free for the next one. Each search returns its few best answers, so
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -45,11 +45,13 @@ class Head:
         centre: [3] m, world.
         radius: m.
         support: share of the sphere's surface that lies on the hull's, 0 to 1.
+        explained: how much of the hull the best upright torso under it explains, against the best head's.
     """
 
     centre: Array
     radius: float
     support: float
+    explained: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -119,20 +121,19 @@ class Grid:
 
 
 def find_heads(
-    grid: Grid, surface: Surface, patch_curvature: Array, centre_of_mass: Array, count: int = 2, tried: int = 5
+    grid: Grid, surface: Surface, patch_curvature: Array, centre_of_mass: Array, count: int = 5
 ) -> list[Head]:
     """Spheres of a head's size that the surface wraps on most sides (sections 2.1 and 2.3).
 
-    Hands, feet and crossed legs wrap spheres too, so an upright torso is hung from each candidate, and the heads whose
-    torso explains most of the hull (eq. 2, locally) are kept.
+    Hands, feet and crossed legs wrap spheres too, so an upright torso is hung from each candidate, and the heads are
+    ranked by how much of the hull it explains (eq. 2, locally).
 
     Args:
         grid: the hull.
         surface: its surface.
         patch_curvature: [N] rad, mean curvature over patches (`curvature_variability`): heads lie in its upper half.
         centre_of_mass: [3] m.
-        count: how many to return at most, best first; a further one only if it explains at least 85 % as much.
-        tried: how many spheres are tried.
+        count: how many to return at most, best first.
     """
     curved = patch_curvature >= np.median(patch_curvature)
     points, normals = surface.points[curved], surface.normals[curved]
@@ -151,13 +152,13 @@ def find_heads(
     for i in np.argsort(-support, kind="stable"):
         if all(np.linalg.norm(centres[i] - head.centre) > 0.12 for head in found):
             found.append(Head(centres[i], float(radii[i]), float(support[i])))
-            if len(found) == tried:
+            if len(found) == count:
                 break
     explained = np.array(
         [_torso_scores(grid, head, centre_of_mass, _PLAIN)[0].max() * head.radius**3 for head in found]
     )
     order = np.argsort(-explained, kind="stable")
-    return [found[n] for n in order[:count] if explained[n] >= 0.85 * explained[order[0]]]
+    return [replace(found[n], explained=float(explained[n] / max(explained[order[0]], 1e-9))) for n in order]
 
 
 # --- torso ------------------------------------------------------------------------------------------------------------

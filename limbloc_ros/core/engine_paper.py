@@ -47,6 +47,8 @@ def _limb_block(kind: str, side: str) -> Block:
     return block_of(f"{kind}_{side}", rows)
 
 
+#: A reading whose energy is higher than this is probably wrong: more heads are tried.
+DOUBTFUL = 0.36
 LIMBS = {(kind, side): _limb_block(kind, side) for kind in ("leg", "arm") for side in "LR"}
 _PARTS_OF_TORSO = np.array([p for p in range(N_PARTS) if PART_NAMES[p] in anchor.TORSO_PARTS])
 _PARTS_OF_LEGS = np.array([p for p in range(N_PARTS) if PART_NAMES[p][:-2] in ("thigh", "shin", "foot")])
@@ -96,18 +98,22 @@ def fit_state(hull: Hull) -> tuple[Branch, Description]:
     """The fitting sequence: head, torso, legs, arms, then everything at once."""
     seen = describe(hull)
     grid = Grid.of(hull)
-    cues = limbs.cues_of(grid, seen.surface, seen.patch_curvature, seen.maxima)
+    heads = anchor.find_heads(grid, seen.surface, seen.patch_curvature, seen.centre_of_mass)
+    likely = [head for head in heads if head.explained >= 0.85]
+    best = _from_heads(grid, likely, seen)
+    if best.terms.total > DOUBTFUL and len(likely) < len(heads):
+        best = _best([best, _from_heads(grid, heads[len(likely) :], seen)], 1)[0]
+    return _refine(best, 2), seen
 
-    branches = [
-        branch
-        for head in anchor.find_heads(grid, seen.surface, seen.patch_curvature, seen.centre_of_mass)
-        for branch in _torsos(grid, head, seen)
-    ]
+
+def _from_heads(grid: Grid, heads: list[Head], seen: Description) -> Branch:
+    """The best reading of the hull that starts from one of these heads (sections 2.3 and 2.4)."""
+    cues = limbs.cues_of(grid, seen.surface, seen.patch_curvature, seen.maxima)
+    branches = [branch for head in heads for branch in _torsos(grid, head, seen)]
     branches = [_add_limbs(grid, branch, "leg", cues) for branch in branches]
-    branches = _best(branches, 3)
-    branches = [_add_limbs(grid, branch, "arm", cues) for branch in branches]
+    branches = [_add_limbs(grid, branch, "arm", cues) for branch in _best(branches, 3)]
     branches = [_refine(branch, 1) for branch in _best(branches, 2)]
-    return _refine(_best(branches, 1)[0], 2), seen
+    return _best(branches, 1)[0]
 
 
 def _torsos(grid: Grid, head: Head, seen: Description) -> list[Branch]:

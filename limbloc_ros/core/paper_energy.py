@@ -37,7 +37,7 @@ Rows = NDArray[np.int64]
 _BEGINS = np.array([JOINT[a] for a, b in STICK_BONES if "finger" not in b and "head_top" not in b])
 _ENDS = np.array([JOINT[b] for a, b in STICK_BONES if "finger" not in b and "head_top" not in b])
 #: Voxels along the edge of a block of neighbours.
-_BLOCK = 6
+_BLOCK = 4
 _SPHERE_BONES = proportions().point_bones[:N_SPHERES]
 
 
