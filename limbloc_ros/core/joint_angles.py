@@ -60,7 +60,7 @@ class NativeAngle:
 
 # name, signed axis on the left or in the middle, description, positive means, range in degrees; in turning order.
 _Row = tuple[str, str, str, str, float, float]
-_TRUNK: list[tuple[str, list[_Row]]] = [
+_TRUNK: tuple[tuple[str, Sequence[_Row]], ...] = (
     (
         "pelvis",
         [
@@ -88,7 +88,7 @@ _TRUNK: list[tuple[str, list[_Row]]] = [
             ("neck_rotation", "+z", "turning the head", "turned left", -90, 90),
         ],
     ),
-]
+)
 _LIMBS: list[tuple[str, list[_Row]]] = [
     (
         "clavicle",
@@ -204,7 +204,7 @@ def native_angles(
         angles = ANGLES_OF[bone]
         axes = np.array([angle.axis for angle in angles])
         if len(angles) == 1:
-            values = [hinge_angle(R, axes[0])]
+            values = np.array([hinge_angle(R, axes[0])])
         elif len(angles) == 2:
             values = _clavicle_angles(R, axes, _shoulder_place(bone, shape))
             world[b] = world[parent] @ turned(axes, values)
@@ -308,7 +308,7 @@ def _shoulder_place(clavicle: str, shape: Array | None) -> Array:
     return np.asarray(offsets[:, 0] if shape is None else offsets[:, 0] + offsets[:, 1:] @ shape[1:])
 
 
-def _clavicle_angles(R: Array, axes: Array, shoulder: Array) -> list[float]:
+def _clavicle_angles(R: Array, axes: Array, shoulder: Array) -> Array:
     """The two angles of a clavicle that put the shoulder where the rotation R puts it.
 
     A turn about the clavicle's own length, which small turns about two axes add up to, does not move the shoulder.
@@ -319,4 +319,4 @@ def _clavicle_angles(R: Array, axes: Array, shoulder: Array) -> list[float]:
     about_x = np.arctan2(z, reach) - np.arctan2(shoulder[2], shoulder[1])
     about_z = np.remainder(about_z + np.pi, 2 * np.pi) - np.pi
     about_x = np.remainder(about_x + np.pi, 2 * np.pi) - np.pi
-    return [float(about_z * axes[0, 2]), float(about_x * axes[1, 0])]
+    return np.array([about_z * axes[0, 2], about_x * axes[1, 0]])

@@ -15,12 +15,12 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header, String
 
-from limbloc_ros.core.joint_angles import ros4hri
 from limbloc_ros.core.pose import Pose
+from limbloc_ros.core.ros4hri import ros4hri
 from limbloc_ros.ros import topics
 from limbloc_ros.ros.messages import NANOSECONDS, angles_to_message, stamp_ns, transform_to_message
 from limbloc_ros.ros.transforms import TransformOutput, link_transforms
-from limbloc_ros.ros.urdf import body_urdf
+from limbloc_ros.ros.urdf import body_urdf, native_urdf
 
 
 class BodyOutput:
@@ -37,6 +37,7 @@ class BodyOutput:
         self._publish_tf = publish_tf
         self._states = node.create_publisher(JointState, topics.body_joint_states(body_id), topics.STREAM_QOS)
         self._urdf = node.create_publisher(String, topics.body_urdf(body_id), topics.LATCHED_QOS)
+        self._native_urdf = node.create_publisher(String, topics.body_native_urdf(body_id), topics.LATCHED_QOS)
         self._ids_list = import_ids_list()
         if self._ids_list is not None:
             self._tracked = node.create_publisher(self._ids_list, topics.BODIES_TRACKED, topics.STREAM_QOS)
@@ -70,6 +71,7 @@ class BodyOutput:
         if not self._description or (changed > urdf_tolerance_m and waited):
             self._description, self._sizes, self._described_ns = body_urdf(pose, self._id), dict(pose.sizes), stamp
             self._urdf.publish(String(data=self._description))
+            self._native_urdf.publish(String(data=native_urdf(pose, self._id)))
         if self._ids_list is not None:
             self._tracked.publish(self._ids_list(header=header, ids=[self._id]))
         self._angles = ros4hri(pose, self._angles)
