@@ -25,8 +25,8 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
 from launch import LaunchDescription
+from limbloc_ros.nodes.graph_plan import load_config, plan_graph
 from limbloc_ros.ros.environment import config_file, graph_environment
-from limbloc_ros.ros.graph_plan import load_config, plan_graph
 from limbloc_ros.ros.supervisor import REFUSED
 
 ARGUMENTS = {

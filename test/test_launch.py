@@ -16,11 +16,11 @@ import yaml
 import limbloc_ros
 from limbloc_ros.core.pose import JOINT
 from limbloc_ros.nodes.composed import KINDS, flatten
+from limbloc_ros.nodes.graph_plan import NODE_SECTIONS, SmartSpaceConfig
 from limbloc_ros.rig.rig_file import load_rig
 from limbloc_ros.ros import topics
 from limbloc_ros.ros.cloud_messages import SURFACE_POINT
 from limbloc_ros.ros.environment import share_folder
-from limbloc_ros.ros.graph_plan import NODE_SECTIONS, SmartSpaceConfig
 
 ROOT = Path(limbloc_ros.__file__).parent.parent
 LAUNCH = ROOT / "launch" / "smart_space.launch.py"
@@ -69,7 +69,7 @@ def test_every_parameter_in_the_installed_file_exists():
     from importlib import import_module
 
     from limbloc_ros.core.config import from_mapping
-    from limbloc_ros.ros.graph_plan import load_config
+    from limbloc_ros.nodes.graph_plan import load_config
 
     config = load_config(CONFIG / "smart_space.yaml")
     for section in NODE_SECTIONS:

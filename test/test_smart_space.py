@@ -20,11 +20,11 @@ from std_msgs.msg import Header
 
 from limbloc_ros.core.errors import ConfigError, InputError, RigError
 from limbloc_ros.nodes import composed, smart_space
+from limbloc_ros.nodes.graph_plan import SmartSpaceConfig, load_config, plan_graph
 from limbloc_ros.recordings.bags import BagReader, BagWriter
 from limbloc_ros.rig.rig_file import load_rig, save_rig
 from limbloc_ros.ros.environment import NetworkConfig, config_file, graph_environment
-from limbloc_ros.ros.graph_plan import ProcessConfig, ProcessPlan, SmartSpaceConfig, load_config, plan_graph
-from limbloc_ros.ros.supervisor import Supervisor
+from limbloc_ros.ros.supervisor import ProcessConfig, ProcessPlan, Supervisor
 from limbloc_ros.simulation.room import default_rig
 
 DOMAIN = 1 + os.getpid() % 100
@@ -402,8 +402,7 @@ def start_smart_space(tmp_path):
     script = f"""
 import sys
 from limbloc_ros.ros.environment import NetworkConfig, graph_environment
-from limbloc_ros.ros.graph_plan import ProcessPlan
-from limbloc_ros.ros.supervisor import Supervisor
+from limbloc_ros.ros.supervisor import ProcessPlan, Supervisor
 def process(i):
     node = {{"kind": "segmentation", "name": f"segmentation_{{i}}", "parameters": {{"camera": f"cam{{i}}"}}}}
     return ProcessPlan(f"cameras_{{i}}", "", (node,))

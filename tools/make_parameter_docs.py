@@ -16,7 +16,7 @@ from limbloc_ros.nodes.replay import ReplaySettings
 from limbloc_ros.nodes.segmentation import SegmentationSettings
 from limbloc_ros.nodes.simulated_cameras import SimulationSettings
 from limbloc_ros.ros.environment import NetworkConfig
-from limbloc_ros.ros.graph_plan import ProcessConfig
+from limbloc_ros.ros.supervisor import ProcessConfig
 
 PAGE = Path(__file__).parents[1] / "docs" / "parameters.md"
 

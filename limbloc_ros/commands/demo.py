@@ -66,10 +66,10 @@ def run(args: argparse.Namespace) -> int:
 
 def _run_live(args: argparse.Namespace, out: Path) -> None:
     """Start the graph, watch it, stop it."""
+    from limbloc_ros.nodes.graph_plan import plan_graph
     from limbloc_ros.nodes.smart_space import config_from_arguments
     from limbloc_ros.rig.rig_file import save_rig
     from limbloc_ros.ros.environment import graph_environment
-    from limbloc_ros.ros.graph_plan import plan_graph
     from limbloc_ros.ros.supervisor import Supervisor
     from limbloc_ros.simulation.room import default_rig
 

@@ -14,8 +14,8 @@ import yaml
 from rclpy.utilities import remove_ros_args
 
 from limbloc_ros.core.errors import ConfigError, LimblocError
+from limbloc_ros.nodes.graph_plan import SmartSpaceConfig, load_config, plan_graph
 from limbloc_ros.ros.environment import config_file, graph_environment
-from limbloc_ros.ros.graph_plan import SmartSpaceConfig, load_config, plan_graph
 from limbloc_ros.ros.supervisor import Supervisor
 
 EXAMPLES = """examples:

@@ -8,6 +8,7 @@ when we are killed.
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -15,15 +16,48 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from types import FrameType
+from typing import Any
 
-from limbloc_ros.ros.graph_plan import ProcessConfig, ProcessPlan
+from limbloc_ros.core.config import setting
 
 POLL_S = 0.1
 #: A process that has run this long starts with the short delay again when it dies.
 SETTLED_S = 30.0
 #: Exit code of `nodes.composed` when a node refused its parameters or input.
 REFUSED = 2
+
+
+@dataclass(frozen=True)
+class ProcessConfig:
+    """How nodes share processes, and how processes are watched."""
+
+    cameras_per_process: int = setting(4, "segmentation nodes in one process", low=1, high=64)
+    carving_with_pose: bool = setting(
+        False, "carve and fit in one process: cheaper, but masks wait while a figure is fitted"
+    )
+    restart_delay_s: float = setting(1.0, "before a dead process is started again", unit="s", low=0.0, high=3600.0)
+    restart_max_delay_s: float = setting(
+        30.0, "the delay doubles up to this while it keeps dying", unit="s", low=0.0, high=3600.0
+    )
+    interrupt_s: float = setting(8.0, "for a clean end after the interrupt signal", unit="s", low=0.0, high=600.0)
+    terminate_s: float = setting(3.0, "after the terminate signal, before it is killed", unit="s", low=0.0, high=600.0)
+
+
+@dataclass(frozen=True)
+class ProcessPlan:
+    """One process: a name for people, the nodes in it, and whether its end is the end of the graph."""
+
+    name: str
+    namespace: str
+    nodes: tuple[Mapping[str, Any], ...]
+    ends_graph: bool = False
+
+    @property
+    def description(self) -> str:
+        """What `limbloc_ros.nodes.composed` takes as its argument."""
+        return json.dumps({"namespace": self.namespace, "nodes": list(self.nodes)})
 
 
 class _Child:

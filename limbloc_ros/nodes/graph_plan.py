@@ -7,7 +7,6 @@ The supervisor and the launch file both start what `plan_graph` says; it starts 
 from __future__ import annotations
 
 import dataclasses
-import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -22,6 +21,7 @@ from limbloc_ros.recordings.bag_frames import CameraStream, camera_streams
 from limbloc_ros.recordings.bags import BagReader
 from limbloc_ros.rig.rig_file import load_rig, save_rig
 from limbloc_ros.ros.environment import NetworkConfig
+from limbloc_ros.ros.supervisor import ProcessConfig, ProcessPlan
 from limbloc_ros.simulation.room import default_rig
 
 #: Sections that hold parameters of nodes, and so names that we do not check here.
@@ -32,22 +32,6 @@ STEPPED_TIMEOUT_S = 5.0
 
 #: The first start compiles the kernels, which takes a while.
 VIEWERS_TIMEOUT_S = 300.0
-
-
-@dataclass(frozen=True)
-class ProcessConfig:
-    """How nodes share processes, and how processes are watched."""
-
-    cameras_per_process: int = setting(4, "segmentation nodes in one process", low=1, high=64)
-    carving_with_pose: bool = setting(
-        False, "carve and fit in one process: cheaper, but masks wait while a figure is fitted"
-    )
-    restart_delay_s: float = setting(1.0, "before a dead process is started again", unit="s", low=0.0, high=3600.0)
-    restart_max_delay_s: float = setting(
-        30.0, "the delay doubles up to this while it keeps dying", unit="s", low=0.0, high=3600.0
-    )
-    interrupt_s: float = setting(8.0, "for a clean end after the interrupt signal", unit="s", low=0.0, high=600.0)
-    terminate_s: float = setting(3.0, "after the terminate signal, before it is killed", unit="s", low=0.0, high=600.0)
 
 
 @dataclass(frozen=True)
@@ -71,21 +55,6 @@ class SmartSpaceConfig:
     simulated_cameras: dict[str, Any] = field(default_factory=dict)
     replay: dict[str, Any] = field(default_factory=dict)
     record: dict[str, Any] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class ProcessPlan:
-    """One process: a name for people, the nodes in it, and whether its end is the end of the graph."""
-
-    name: str
-    namespace: str
-    nodes: tuple[Mapping[str, Any], ...]
-    ends_graph: bool = False
-
-    @property
-    def description(self) -> str:
-        """What `limbloc_ros.nodes.composed` takes as its argument."""
-        return json.dumps({"namespace": self.namespace, "nodes": list(self.nodes)})
 
 
 def load_config(path: str | Path, overrides: Mapping[str, Any] | None = None) -> SmartSpaceConfig:
