@@ -97,8 +97,8 @@ def shorten(masks):
     ("change", "message"),
     [
         (rename, r"expected masks of the rig's cameras cam0, cam1, .*, got side"),
-        (narrow, r"camera cam1 is 640x480 px, so its masks must be uint8 \[F, 480, 80\], got uint8 \[10, 480, 40\]"),
-        (shorten, r"expected equally many frames of every camera, got .*'cam1': 9\b"),
+        (narrow, r"camera cam1 is 640x480 px, so its masks must be uint8 \[F, 480, 80\], got uint8 \[12, 480, 40\]"),
+        (shorten, r"expected equally many frames of every camera, got .*'cam1': 11\b"),
         (dict.clear, r"got none"),
     ],
 )

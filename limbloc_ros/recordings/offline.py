@@ -121,7 +121,9 @@ def process(
 def prepare(say: Callable[[str], None] = lambda text: None) -> None:
     """Compile or load the kernels, once for all worker processes; when that takes long, `say` tells so."""
     cv2.setNumThreads(1)
-    patience = threading.Timer(2.0, say, ["compiling the numeric kernels; only the first run does, half a minute"])
+    patience = threading.Timer(
+        4.0, say, ["loading the numeric kernels; the first run compiles them, which takes a minute"]
+    )
     patience.daemon = True
     patience.start()
     try:
