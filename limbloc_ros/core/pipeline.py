@@ -40,6 +40,11 @@ class Carver:
         silhouettes = measure_silhouettes(masks, self.rig, self._packed, self.config)
         return carve_silhouettes(silhouettes, self.rig, self.config)
 
+    @staticmethod
+    def warm_up() -> None:
+        """Compile or load the carving kernels, so that the first frame is not slow."""
+        Carver(*_warm_up_room()).carve(_warm_up_masks())
+
 
 class PoseEstimator:
     """The fitting half: hull -> pose.

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import functools
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -32,6 +33,9 @@ TICK_S = 0.005
 #: cameras must lose the same frames, or the sets that are carved lack some of them.
 BACKLOG = 2
 
+#: Once per process, however many nodes are composed in it.
+warm_up = functools.cache(Carver.warm_up)
+
 
 @dataclass(frozen=True)
 class CarvingSettings:
@@ -60,6 +64,7 @@ class CarvingNode(Node):
         self.rig_source: RigFromTopics | None = None
         self.synchroniser: StampSynchroniser[Pixels] | None = None
         self.finished: list[FrameSet[Pixels]] = []
+        warm_up()
         self.hull = self.create_publisher(PointCloud2, topics.HULL, topics.STREAM_QOS)
         s = self.settings
         if s.rig_file:

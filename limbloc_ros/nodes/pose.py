@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import functools
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -32,6 +33,9 @@ from limbloc_ros.ros.parameters import NodeParameters
 
 #: Longer without a hull is worth a warning.
 SILENT_S = 2.0
+
+#: Once per process, however many nodes are composed in it.
+warm_up = functools.cache(PoseEstimator.warm_up)
 
 
 @dataclass(frozen=True)
@@ -75,7 +79,7 @@ class PoseNode(Node):
         self.surface = self.create_publisher(PointCloud2, topics.SURFACE, topics.STREAM_QOS)
         self.body = BodyOutput(self, self.settings.body_id, self.settings.publish_tf)
         self.get_logger().info("loading the kernels; the first start compiles them, which may take a minute")
-        PoseEstimator.warm_up()
+        warm_up()
         self.health = Health(self, self.describe)
         self.create_subscription(PointCloud2, topics.HULL, self.on_hull, topics.NEWEST_QOS)
         self.get_logger().info("ready")

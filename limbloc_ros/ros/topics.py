@@ -74,6 +74,11 @@ def body_urdf(body_id: str) -> str:
     return f"humans/bodies/{body_id}/urdf"
 
 
+def body_native_urdf(body_id: str) -> str:
+    """std_msgs/String, latched: the URDF whose joints are those of JOINT_ANGLES."""
+    return f"humans/bodies/{body_id}/native_urdf"
+
+
 def body_frame(body_id: str) -> str:
     """TF frame of a person: mid-hips, x forward, z to the head."""
     return f"body_{body_id}"
