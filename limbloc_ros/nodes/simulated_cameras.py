@@ -128,8 +128,7 @@ class SimulatedCamerasNode(Node):
 
     def _is_watched(self) -> bool:
         """Whether somebody subscribed to every camera."""
-        outputs = [[out[c.name] for out in (self.raw, self.jpeg) if c.name in out] for c in self.cameras]
-        return all(any(output.get_subscription_count() for output in of_camera) for of_camera in outputs)
+        return all(_watched(self.raw.get(c.name)) or _watched(self.jpeg.get(c.name)) for c in self.cameras)
 
     def publish(self, frame: int) -> None:
         """Render and publish one instant."""
@@ -139,15 +138,13 @@ class SimulatedCamerasNode(Node):
         for camera in self.cameras:
             header = make_header(stamp, topics.optical_frame(camera.name))
             self.infos[camera.name].publish(camera_to_info(camera, header))
-            raw, jpeg = self.raw.get(camera.name), self.jpeg.get(camera.name)
-            wants_raw = raw is not None and raw.get_subscription_count() > 0
-            wants_jpeg = jpeg is not None and jpeg.get_subscription_count() > 0
-            if not (wants_raw or wants_jpeg):
+            raw, jpeg = _watched(self.raw.get(camera.name)), _watched(self.jpeg.get(camera.name))
+            if raw is None and jpeg is None:
                 continue
             pixels = self.room.render(camera.name, t)
-            if wants_raw:
+            if raw is not None:
                 raw.publish(pixels_to_image(pixels, header))
-            if wants_jpeg:
+            if jpeg is not None:
                 jpeg.publish(pixels_to_compressed(pixels, header, self.settings.jpeg_quality))
         if self.truth is not None:
             self.truth.publish(joints_to_message(self.room.joints(t), make_header(stamp, self.settings.world_frame)))
@@ -174,6 +171,11 @@ class SimulatedCamerasNode(Node):
 
     def _on_settings(self, settings: SimulationSettings) -> None:
         self.settings = settings
+
+
+def _watched(publisher: Any | None) -> Any | None:
+    """The publisher if it exists and somebody subscribed to it."""
+    return publisher if publisher is not None and publisher.get_subscription_count() else None
 
 
 def main() -> int:
