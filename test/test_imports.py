@@ -47,6 +47,7 @@ CORE_ORDER = (
     "engine_robust",
     "tracking",
     "joint_angles",
+    "ros4hri",
     "pipeline",
 )
 

@@ -22,6 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from limbloc_ros.core import _joint_angles_kernels as kernels
 from limbloc_ros.core._figure_kernels import exp_so3
 from limbloc_ros.core.figure import BONE, BONE_NAMES, N_BONES, PARENTS, proportions
 
@@ -163,6 +164,16 @@ ANGLES_OF: dict[str, tuple[NativeAngle, ...]] = {
     bone: tuple(angle for angle in NATIVE_ANGLES if angle.bone == bone) for bone in BONE_NAMES
 }
 
+#: Axes [N, 3], lowest and highest angle [N] of each bone.
+_TABLES: dict[str, tuple[Array, Array, Array]] = {
+    bone: (
+        np.array([angle.axis for angle in angles]),
+        np.array([-np.inf if angle.continuous else angle.low for angle in angles]),
+        np.array([np.inf if angle.continuous else angle.high for angle in angles]),
+    )
+    for bone, angles in ANGLES_OF.items()
+}
+
 
 @dataclass(frozen=True)
 class Range:
@@ -201,8 +212,7 @@ def native_angles(
     for b, bone in enumerate(BONE_NAMES):
         parent = PARENTS[b]
         R = world[b] if parent < 0 else world[parent].T @ world[b]
-        angles = ANGLES_OF[bone]
-        axes = np.array([angle.axis for angle in angles])
+        angles, (axes, low, high) = ANGLES_OF[bone], _TABLES[bone]
         if len(angles) == 1:
             values = np.array([hinge_angle(R, axes[0])])
         elif len(angles) == 2:
@@ -210,9 +220,9 @@ def native_angles(
             world[b] = world[parent] @ turned(axes, values)
         else:
             last = None if previous is None else np.array([previous[angle.name] for angle in angles])
-            ranges = [Range(angle.low, angle.high, angle.continuous) for angle in angles]
-            values = solve_triple(R, axes, ranges, last, NATIVE_SLACK)
-        result.update(zip((angle.name for angle in angles), map(float, values), strict=True))
+            values = _solve(R, axes, low, high, last, NATIVE_SLACK)
+        for angle, value in zip(angles, values, strict=True):
+            result[angle.name] = float(value)
     return {angle.name: result[angle.name] for angle in NATIVE_ANGLES}
 
 
@@ -233,7 +243,7 @@ def turned(axes: Array, angles: Sequence[float] | Array) -> Array:
 def hinge_angle(R: Array, axis: Array) -> float:
     """The angle (rad) about `axis` that comes nearest to the rotation `R`."""
     skew = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-    return float(np.arctan2(skew @ axis, np.trace(R) - axis @ R @ axis))
+    return float(np.arctan2(skew @ axis, R[0, 0] + R[1, 1] + R[2, 2] - axis @ R @ axis))
 
 
 def solve_triple(
@@ -253,53 +263,15 @@ def solve_triple(
     Returns:
         Angles that pass +-pi without a jump while they stay within half a turn of their range's middle and a bit.
     """
-    first, second, third = axes
-    last = R @ third
-    along, across = float(np.cross(first, second) @ last), float(second @ last)
-    sine = float(np.hypot(along, across))
-    rest = np.array([min(max(0.0, r.low), r.high) for r in ranges])
-    start = rest if previous is None else previous
-    # At the pole itself rounding must not choose the first angle, with or without a previous frame.
-    damping = max(slack if previous is not None else 0.0, 1e-7)
-    trust = sine**2 / (sine**2 + damping**2)
-    solutions = []
-    for flip in (0.0, np.pi):
-        step = np.remainder(np.arctan2(-across, along) + flip - start[0] + np.pi, 2 * np.pi) - np.pi
-        q1 = float(start[0] + trust * step)
-        triple = (q1, *_other_two(R, axes, q1))
-        near = np.array([0.5 * (r.low + r.high) for r in ranges]) if previous is None else start
-        solutions.append(np.array([_wound(q, n, r) for q, n, r in zip(triple, near, ranges, strict=True)]))
-    if previous is None:
-        costs = [_beyond(q, ranges, 0.0) + 0.01 * float(((q - rest) ** 2).sum()) for q in solutions]
-    else:
-        costs = [30.0 * _beyond(q, ranges, _STRAY) + float(((q - start) ** 2).sum()) for q in solutions]
-    return solutions[0] if costs[0] <= costs[1] else solutions[1]
+    low = np.array([-np.inf if r.continuous else r.low for r in ranges])
+    high = np.array([np.inf if r.continuous else r.high for r in ranges])
+    return _solve(R, axes, low, high, previous, slack)
 
 
-def _beyond(q: Array, ranges: Sequence[Range], margin: float) -> float:
-    """How far angles are out of their ranges, rad squared."""
-    bounded = [(x, r) for x, r in zip(q, ranges, strict=True) if not r.continuous]
-    return float(sum(max(0.0, r.low - margin - x, x - r.high - margin) ** 2 for x, r in bounded))
-
-
-def _other_two(R: Array, axes: Array, q1: float) -> tuple[float, float]:
-    """The second and third angle that come nearest to R once the first is chosen."""
-    first, second, third = axes
-    R = exp_so3(-first * q1) @ R
-    v = R @ third
-    q2 = float(np.arctan2(second @ np.cross(third, v), third @ v))
-    u = exp_so3(-second * q2) @ R @ second
-    return q2, float(np.arctan2(third @ np.cross(second, u), second @ u))
-
-
-def _wound(angle: float, start: float, limits: Range) -> float:
-    """`angle` plus whole turns, nearest to `start`; but near its range, so that turns do not add up over time."""
-    turn = 2 * np.pi
-    wound = angle + turn * round((start - angle) / turn)
-    middle, reach = 0.5 * (limits.low + limits.high), 1.5 * np.pi
-    if limits.continuous or abs(wound - middle) <= reach:
-        return wound
-    return angle + turn * round((middle - angle) / turn)
+def _solve(R: Array, axes: Array, low: Array, high: Array, previous: Array | None, slack: float) -> Array:
+    follow = previous is not None
+    start = previous if previous is not None else np.zeros(3)
+    return kernels.triple(R, axes, low, high, start, follow, slack, _STRAY)  # type: ignore[no-any-return]
 
 
 def _shoulder_place(clavicle: str, shape: Array | None) -> Array:
