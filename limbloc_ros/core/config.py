@@ -70,7 +70,7 @@ class BackgroundConfig:
         live=True,
     )
     edge_fraction: float = setting(
-        0.5,
+        0.45,
         "the outline runs where the change falls below this fraction of the change just inside (0: no trimming)",
         low=0.0,
         high=0.95,
