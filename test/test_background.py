@@ -262,13 +262,18 @@ class TestCleaning:
         assert mask[152:188, 102:130].all()
         assert not mask[280:300, 205:].any()
 
-    def test_a_faint_halo_is_trimmed(self):
-        self.draw(slice(95, 305), slice(95, 205), 5, 5)
+    def test_the_blurred_rim_is_trimmed(self):
+        self.draw(slice(98, 302), slice(98, 202), 12, 5)
         self.draw(slice(100, 300), slice(100, 200), 60, 20)
         truth = np.zeros((480, 640), dtype=bool)
         truth[100:300, 100:200] = True
         assert iou(self.mask(), truth) > 0.99
-        assert iou(self.mask(edge_fraction=0.0), truth) < 0.9
+        assert iou(self.mask(edge_fraction=0.0), truth) < 0.95
+
+    def test_a_faint_limb_beside_a_bright_trunk_stays(self):
+        self.draw(slice(100, 300), slice(100, 200), 60, 20)
+        self.draw(slice(150, 164), slice(200, 300), 6, 6)
+        assert self.mask()[152:162, 203:298].mean() > 0.98
 
     def test_a_body_at_the_image_border_reaches_it(self):
         self.draw(slice(300, 480), slice(0, 60))

@@ -30,6 +30,7 @@ CORE_ORDER = (
     "pose",
     "images",
     "synchroniser",
+    "mask_cleaning",
     "background",
     "silhouettes",
     "hull",

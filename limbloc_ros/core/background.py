@@ -213,7 +213,8 @@ class BackgroundModel:
             self._estimate_noise(planes)
         change, colour = self._measure(planes)
         threshold = round(self._config.threshold_sigmas * CHANGE_SCALE)
-        if np.count_nonzero(change >= threshold) > self._config.relearn_fraction * change.size:
+        far = cv2.compare(change, threshold, cv2.CMP_GE)
+        if cv2.countNonZero(far) > self._config.relearn_fraction * change.size:
             return self._light_jumped(planes)
         self._upset = 0
         mask = clean_mask(change, colour, self._config)

@@ -26,11 +26,7 @@ BODY_BORDER = 0.7
 CLOTH_COLOUR = 0.6
 """... and when its colour differs from the background's by more than this part of `shadow_sigmas` on average."""
 
-HALO_FRACTION = 0.3
-"""The halo around a person has less than this part of the change at the outline."""
-
 _OUTLINE = np.ones((5, 5), dtype=np.uint8)
-_HALO = np.ones((13, 13), dtype=np.uint8)
 
 
 def clean_mask(change: Bytes, colour: Bytes, config: BackgroundConfig) -> Bytes:
@@ -71,9 +67,7 @@ def clean_mask(change: Bytes, colour: Bytes, config: BackgroundConfig) -> Bytes:
     add_body_parts(mask, changed, colour, threshold, CLOTH_COLOUR * weak_colour, BODY_BORDER)
     _tidy(mask, changed, colour, threshold, weak_colour, blob, hole)
     if config.edge_fraction > 0:
-        # First the wide faint halo that video codecs draw around things, then the blur of the outline itself.
-        mask = _trim_outline(mask, change, HALO_FRACTION * config.edge_fraction, _HALO)
-        mask = _trim_outline(mask, change, config.edge_fraction, _OUTLINE)
+        mask = _trim_outline(mask, change, config.edge_fraction)
         mask = _morph(mask, cv2.MORPH_CLOSE, 1.0)
         _tidy(mask, changed, colour, threshold, weak_colour, blob, hole)
     full[rows, columns] = mask
@@ -136,12 +130,13 @@ def _looks_like_cloth(
     return bool(colour[y : y + h, x : x + w][hole].mean() > CLOTH_COLOUR * weak_colour)
 
 
-def _trim_outline(mask: Bytes, change: Bytes, fraction: float, window: Bytes) -> Bytes:
-    """Drop outline pixels whose change is below `fraction` of the largest one within the window around them.
+def _trim_outline(mask: Bytes, change: Bytes, fraction: float) -> Bytes:
+    """Drop outline pixels whose change is below `fraction` of the largest one within two pixels.
 
-    Blur spreads a person by a pixel or two; the true outline is where the change has half its inner value.
+    Blur spreads a person by a pixel or two; the true outline is where the change has half its inner value. A wider
+    window would also drop the halo that video codecs draw, but with it faint limbs beside something of high contrast.
     """
-    inner = cv2.dilate(cv2.bitwise_and(change, mask), window)
-    core = cv2.erode(mask, window)
+    inner = cv2.dilate(cv2.bitwise_and(change, mask), _OUTLINE)
+    core = cv2.erode(mask, _OUTLINE)
     enough = cv2.compare(change, cv2.convertScaleAbs(inner, alpha=fraction), cv2.CMP_GE)
     return np.asarray(cv2.bitwise_and(mask, cv2.bitwise_or(core, enough)), dtype=np.uint8)
