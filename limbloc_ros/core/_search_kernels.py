@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from limbloc_ros.core._figure_kernels import exp_so3, forward, part_distance
+from limbloc_ros.core._figure_kernels import exp_so3, forward, part_bounds, part_distance
 
 
 @njit(cache=True, inline="always")  # type: ignore[misc, unused-ignore]
@@ -311,22 +311,47 @@ def tube_score(
 
 
 @njit(cache=True)  # type: ignore[misc, unused-ignore]
-def explained_fraction(
-    ax: float, ay: float, az: float, bx: float, by: float, bz: float, parts: Any, spheres: Any, radii: Any, skip: float
-) -> float:
-    """Fraction of a bone that lies inside parts that already explain the volume, deep counting more."""
+def explained_grid(sdf: Any, origin: Any, voxel: float, stride: int, parts: Any, spheres: Any, radii: Any) -> Any:
+    """How far each cell of `stride` voxels lies inside the given parts: 0 outside, 1 from 5 cm depth on; float32."""
+    nx = (sdf.shape[0] + stride - 1) // stride
+    ny = (sdf.shape[1] + stride - 1) // stride
+    nz = (sdf.shape[2] + stride - 1) // stride
+    out = np.zeros((nx, ny, nz), np.float32)
+    bounds = part_bounds(parts, spheres, radii)
     w = np.empty(3)
+    for i in range(nx):
+        x = origin[0] + i * stride * voxel
+        for j in range(ny):
+            y = origin[1] + j * stride * voxel
+            for k in range(nz):
+                if sdf[i * stride, j * stride, k * stride] > 0.02:
+                    continue
+                z = origin[2] + k * stride * voxel
+                worst = 0.0
+                for p in range(len(parts)):
+                    bx = x - bounds[p, 0]
+                    by = y - bounds[p, 1]
+                    bz = z - bounds[p, 2]
+                    if bx * bx + by * by + bz * bz > bounds[p, 3] * bounds[p, 3]:
+                        continue
+                    worst = min(worst, part_distance(x, y, z, parts[p], spheres, radii, w))
+                out[i, j, k] = min(-worst / 0.05, 1.0)
+    return out
+
+
+@njit(cache=True)  # type: ignore[misc, unused-ignore]
+def explained_fraction(
+    grid: Any, origin: Any, cell: float, ax: float, ay: float, az: float, bx: float, by: float, bz: float, skip: float
+) -> float:
+    """Mean of the explained grid along a bone, from the fraction `skip` on."""
     total = 0.0
     for n in range(4):
         t = skip + (1.0 - skip) * (n + 0.5) / 4
-        x = ax + t * (bx - ax)
-        y = ay + t * (by - ay)
-        z = az + t * (bz - az)
-        worst = 1.0
-        for p in range(len(parts)):
-            d = part_distance(x, y, z, parts[p], spheres, radii, w)
-            worst = min(worst, d)
-        total += min(max(-worst / 0.05, 0.0), 1.0)
+        i = int((ax + t * (bx - ax) - origin[0]) / cell + 0.5)
+        j = int((ay + t * (by - ay) - origin[1]) / cell + 0.5)
+        k = int((az + t * (bz - az) - origin[2]) / cell + 0.5)
+        if i >= 0 and j >= 0 and k >= 0 and i < grid.shape[0] and j < grid.shape[1] and k < grid.shape[2]:
+            total += grid[i, j, k]
     return total / 4
 
 
@@ -341,9 +366,8 @@ def search_limb(
     sdf: Any,
     origin: Any,
     voxel: float,
-    parts: Any,
-    spheres: Any,
-    radii: Any,
+    explained: Any,
+    stride: int,
     skip: float,
     clip: float,
     explained_weight: float,
@@ -383,7 +407,9 @@ def search_limb(
         )
         if s > 3.2:
             continue
-        s += explained_weight * explained_fraction(base[0], base[1], base[2], x, y, z, parts, spheres, radii, 0.4)
+        s += explained_weight * explained_fraction(
+            explained, origin, stride * voxel, base[0], base[1], base[2], x, y, z, 0.4
+        )
         middle[count, 0] = x
         middle[count, 1] = y
         middle[count, 2] = z
@@ -421,7 +447,7 @@ def search_limb(
             s2 = tube_score(sdf, origin, voxel, ex, ey, ez, x, y, z, tube_radii[1], tube_radii[2], 6, clip, 0.0)
             if s2 > 3.2:
                 continue
-            s2 += explained_weight * explained_fraction(ex, ey, ez, x, y, z, parts, spheres, radii, 0.0)
+            s2 += explained_weight * explained_fraction(explained, origin, stride * voxel, ex, ey, ez, x, y, z, 0.0)
             # the hand or heel goes on a little beyond the end
             tip = depth_at(
                 sdf, origin, voxel, x + 0.5 * tip_length * dx, y + 0.5 * tip_length * dy, z + 0.5 * tip_length * dz

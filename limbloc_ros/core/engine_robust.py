@@ -23,10 +23,10 @@ Array = NDArray[np.float64]
 class Effort:
     """How much is searched; the defaults are for one frame alone."""
 
-    torsos: int = 5
+    torsos: int = 8
     quick_points: int = 350
     quick_iterations: int = 8
-    finalists: int = 3
+    finalists: int = 5
     points: int = 1200
     iterations: int = 20
 
@@ -65,7 +65,8 @@ def complete_limbs(state: FigureState, hull: Hull, medial: Medial, samples: Arra
     explained = figure.kernels.flesh_distance(
         samples, figure.PART_SPHERES[search.TRUNK_PARTS], placed.spheres, placed.radii
     )[0] < 0.04
-    legs = [search.limb_candidates(hull, medial, placed, LEG, s, search.UPPER_TRUNK_PARTS, 40) for s in "LR"]
+    taken = search.explained_volume(hull, placed, search.UPPER_TRUNK_PARTS)
+    legs = [search.limb_candidates(hull, medial, placed, LEG, s, taken, 40) for s in "LR"]
     leg_pairs = search.limb_pairs(legs[0], legs[1], samples, explained, 0.02, 1)
     if leg_pairs:
         a, b, _ = leg_pairs[0]
@@ -80,7 +81,8 @@ def complete_arms(state: FigureState, hull: Hull, medial: Medial, samples: Array
     explained = figure.kernels.flesh_distance(
         samples, figure.PART_SPHERES[BODY_PARTS], placed.spheres, placed.radii
     )[0] < 0.035
-    arms = [search.limb_candidates(hull, medial, placed, ARM, s, BODY_PARTS, 40) for s in "LR"]
+    taken = search.explained_volume(hull, placed, BODY_PARTS)
+    arms = [search.limb_candidates(hull, medial, placed, ARM, s, taken, 40) for s in "LR"]
     out = []
     for a, b, _ in search.limb_pairs(arms[0], arms[1], samples, explained, 0.02, pairs):
         armed = search.with_limb(state, placed, ARM, "L", arms[0].found[a])

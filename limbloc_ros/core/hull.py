@@ -107,11 +107,12 @@ def lattice_bounds(rig: Rig, voxel_m: float) -> tuple[NDArray[np.int64], NDArray
 
 
 def evaluate(
-    silhouettes: Silhouettes, rig: Rig, voxel_m: float, band_m: float, keep_second: bool = True, min_seen: int = 2
+    silhouettes: Silhouettes, rig: Rig, voxel_m: float, band_m: float, keep_second: bool = True
 ) -> Voxels:
     """Signed distances of every voxel near the hull, by halving blocks that may hold some of it.
 
-    Exact: the same voxels and values as the evaluation of every voxel of the volume.
+    Exact: the same voxels and values as the evaluation of every voxel of the volume. A voxel must be seen by more
+    than half of the cameras.
 
     Returns:
         indices int32 [V, 3], largest camera distance float32 [V] m, second largest float32 [V] m, and the index of
@@ -119,6 +120,8 @@ def evaluate(
         keep_second, whose second largest is negative (those that a single camera denies).
     """
     low, high = lattice_bounds(rig, voxel_m)
+    # What most cameras do not see is not carved by them either: a phantom there may be as large as a house.
+    min_seen = max(min(2, len(silhouettes.names)), len(silhouettes.names) // 2 + 1)
     axes = [np.arange(low[a], high[a], ROOT, dtype=np.int32) for a in range(3)]
     blocks = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     table = (silhouettes.cameras, silhouettes.boxes, silhouettes.field)
@@ -219,13 +222,12 @@ def carve_silhouettes(silhouettes: Silhouettes, rig: Rig, config: HullConfig) ->
         reasons = "; ".join(f"{name}: {why}" for name, why in silhouettes.rejected.items())
         return NoPerson(f"{len(silhouettes.names)} usable masks, expected at least {config.min_cameras} ({reasons})")
     silhouettes = reject_dead_cameras(silhouettes, rig, config)
-    min_seen = min(config.min_cameras, len(silhouettes.names))
-    voxels = evaluate(silhouettes, rig, config.voxel_m, config.band_m, min_seen=min_seen)
+    voxels = evaluate(silhouettes, rig, config.voxel_m, config.band_m)
     covered = cover_silhouettes(silhouettes, voxels, config)
     contradiction = unexplained_fraction(silhouettes, covered)
     mended = mend_silhouettes(silhouettes, covered, voxels, config)
     if mended is not silhouettes:
-        voxels = evaluate(mended, rig, config.voxel_m, config.band_m, min_seen=min_seen)
+        voxels = evaluate(mended, rig, config.voxel_m, config.band_m)
     indices, first, second, _ = voxels
     # Ragged masks bite a little from every side. The more the cameras contradict each other, the less may a single
     # one decide; with few cameras two vetoes would leave far too much.

@@ -232,8 +232,19 @@ class Limbs:
     found: Array
 
 
+#: Edge of the cells in which explained volume is looked up, in voxels.
+STRIDE = 2
+
+
+def explained_volume(hull: Hull, placed: Placed, parts: NDArray[np.int64]) -> NDArray[np.float32]:
+    """How much of the hull the figure's parts with these indices explain already, in cells of STRIDE voxels."""
+    return kernels.explained_grid(  # type: ignore[no-any-return]
+        hull.sdf, hull.origin_m, hull.voxel_m, STRIDE, figure.PART_SPHERES[parts], placed.spheres, placed.radii
+    )
+
+
 def limb_candidates(
-    hull: Hull, medial: Medial, placed: Placed, kind: LimbKind, side: str, solid_parts: NDArray[np.int64], keep: int
+    hull: Hull, medial: Medial, placed: Placed, kind: LimbKind, side: str, explained: NDArray[np.float32], keep: int
 ) -> Limbs:
     """Where one limb may go from its root joint.
 
@@ -242,7 +253,7 @@ def limb_candidates(
         placed: the figure whose torso (and legs) are believed.
         kind: ARM or LEG.
         side: `L` or `R`.
-        solid_parts: indices of the figure's parts that already explain volume.
+        explained: `explained_volume` of the parts that a limb does not run through.
         keep: most candidates.
     """
     first, second, third = (BONE[f"{name}_{side}"] for name in kind.bones)
@@ -267,8 +278,7 @@ def limb_candidates(
         near = near[:: len(near) // 500 + 1]
     found = kernels.search_limb(
         base, lengths, radii, tip_m, near, sphere_directions(100), hull.sdf, hull.origin_m, hull.voxel_m,
-        figure.PART_SPHERES[solid_parts], placed.spheres, placed.radii, kind.skip, 0.04 * float(np.exp(0)),
-        kind.explained_weight, forbidden, keep,
+        explained, STRIDE, kind.skip, 0.04, kind.explained_weight, forbidden, keep,
     )  # fmt: skip
     return Limbs(base, lengths, radii, tip_m, found)
 
