@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Joint angles: exact, of the right sign, the same on both sides, and continuous through every pole."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from figure_poses import fitted_states, pose_of, posed, random_state
@@ -266,6 +268,23 @@ def test_a_hinge_takes_the_nearest_angle():
 def test_the_wrong_number_of_bones_is_refused():
     with pytest.raises(ValueError, match=r"rotations of 19 bones.*got an array \[5, 3, 3\]"):
         native_angles(np.tile(np.eye(3), (5, 1, 1)))
+
+
+def test_the_documentation_lists_every_angle_with_its_axis_and_range():
+    rows = {}
+    for line in (Path(__file__).parents[1] / "docs" / "model.md").read_text().splitlines():
+        cells = [cell.strip() for cell in line.strip("|").split("|")]
+        if len(cells) == 6 and cells[0].startswith("`") and cells[1].startswith("`"):
+            rows[cells[0].strip("`")] = cells
+    for angle in NATIVE_ANGLES:
+        row = rows[angle.name.replace("_L_", "_S_").replace("_R_", "_S_")]
+        axis = f"{'-+'[sum(angle.axis) > 0]}{'xyz'[int(np.argmax(np.abs(angle.axis)))]}"
+        left, _, right = row[2].partition(" ")
+        assert axis == (right.strip("()") if "_R_" in angle.name and right else left), angle.name
+        assert row[3:5] == [angle.description, angle.sign]
+        span = "any" if angle.continuous else f"{np.degrees(angle.low):.0f} to {np.degrees(angle.high):.0f}"
+        assert row[5] == span, angle.name
+    assert len(rows) == sum("_R_" not in angle.name for angle in NATIVE_ANGLES)
 
 
 def test_a_pose_carries_the_angles_in_order():
