@@ -61,9 +61,13 @@ def signed_distance_px(mask: NDArray[np.uint8]) -> NDArray[np.float32]:
     The outline runs half-way between the last foreground and the first background pixel centre.
     """
     solid = np.not_equal(mask, 0).astype(np.uint8)
-    inner = cv2.distanceTransform(solid, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    outer = cv2.distanceTransform(1 - solid, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    return np.where(solid > 0, 0.5 - inner, outer - 0.5).astype(np.float32)
+    distance = cv2.distanceTransform(solid, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    distance += cv2.distanceTransform(1 - solid, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    # OpenCV takes an approximate root where its vectors fit, so the last bit depends on the alignment in memory, and
+    # the same bag would not give the same angles every time. Squared distances are whole numbers: round them, and take
+    # the root anew.
+    distance = np.sqrt(np.rint(np.square(distance))) - np.float32(0.5)
+    return np.asarray(np.where(solid > 0, -distance, distance), dtype=np.float32)
 
 
 def cleaned(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
