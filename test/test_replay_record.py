@@ -215,6 +215,16 @@ def test_stepped_replay_goes_on_without_an_answer_and_says_so(make, context, tmp
     assert "4 sets of images, 1 without a result" in replay.summary()
 
 
+def test_stepped_replay_expects_no_answer_to_a_single_image(make, context, tmp_path):
+    write_bag(tmp_path / "bag", count=3, lost={(1, 0)})
+    answerer = make(Answerer)
+    answerer.open = 1  # the first image stands alone and is not answered
+    answerer.silent_for = (0,)
+    replay = make(ReplayNode, bag=str(tmp_path / "bag"), mode="stepped", result_timeout_s=20.0, settle_s=0.3)
+    assert spin([answerer, replay], context, until=replay.done.is_set, timeout_s=15)
+    assert (replay.steps, replay.unanswered, replay.published) == (2, 0, 5)
+
+
 def test_masks_are_replayed_when_there_are_no_images(make, context, tmp_path):
     write_bag(tmp_path / "bag", make_message=png, ending="mask/compressed", kind=COMPRESSED)
     listener = make(Listener, ["/cam0/mask/compressed"], CompressedImage)

@@ -70,6 +70,7 @@ class ReplaySettings:
         1.0, "pause between the first subscriber and the first message", unit="s", low=0.0, high=60.0
     )
     result_topic: str = setting(JOINTS, "PoseArray that answers each set of images in stepped mode")
+    min_cameras: int = setting(2, "stepped mode expects no answer to fewer images than this", low=1, high=64)
     result_timeout_s: float = setting(
         10.0, "stepped mode goes on without an answer after this", unit="s", low=0.1, high=3600.0
     )
@@ -281,6 +282,9 @@ class ReplayNode(Node):
             self._answers.clear()
         for message in frames.values():
             self._publish(message)
+        later = [message for message in companions if message.stamp_ns > end_ns]
+        if len(frames) < self.settings.min_cameras:
+            return later
         self.steps += 1
         with self._answered:
             answered = self._answered.wait_for(
@@ -295,7 +299,7 @@ class ReplayNode(Node):
                 f"{self.settings.result_timeout_s:g} s"
                 + (f" (not in the bag: {', '.join(missing)})" if missing else "")
             )
-        return [message for message in companions if message.stamp_ns > end_ns]
+        return later
 
     def _publish(self, message: BagMessage) -> None:
         try:
