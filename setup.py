@@ -25,7 +25,7 @@ setup(
     maintainer_email="maintainers@limbloc.org",
     license="Apache-2.0",
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
-    package_data={NAME: ["py.typed", "simulation/data/*"]},
+    package_data={NAME: ["py.typed", "core/*.npz", "simulation/data/*"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (SHARE, ["package.xml"]),

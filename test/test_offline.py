@@ -239,7 +239,7 @@ def test_wrong_parameters_are_named(tmp_path, text, message):
 
 
 def test_all_other_keys_of_the_smart_spaces_file_are_known():
-    from limbloc_ros.ros.graph_plan import SmartSpaceConfig
+    from limbloc_ros.nodes.graph_plan import SmartSpaceConfig
 
     ours = {"segmentation", "segmentation_of", "carving", "pose"}
     assert set(GRAPH_KEYS) == {field.name for field in dataclasses.fields(SmartSpaceConfig)} - ours
