@@ -121,7 +121,7 @@ class Grid:
 
 
 def find_heads(
-    grid: Grid, surface: Surface, patch_curvature: Array, centre_of_mass: Array, count: int = 5
+    grid: Grid, surface: Surface, patch_curvature: Array, centre_of_mass: Array, count: int = 8
 ) -> list[Head]:
     """Spheres of a head's size that the surface wraps on most sides (sections 2.1 and 2.3).
 
@@ -225,7 +225,7 @@ def find_torsos(grid: Grid, head: Head, centre_of_mass: Array, count: int = 4) -
         first = int(np.argmax(free))
         same = np.linalg.norm(joints - joints[first], axis=2).max(axis=1) < 0.12
         turned = np.linalg.norm(joints[:, _MIRRORED] - joints[first], axis=2).max(axis=1) < 0.15
-        for n in (first, *np.flatnonzero(turned)[:1]):
+        for n in (first, *np.flatnonzero(turned & free)[:1]):
             state = _hang(head, table, int(t[n]), float(size[n]), turns[r[n]])
             torsos.append(Torso(state, float(score.ravel()[order[n]])))
         free &= ~(same | turned)

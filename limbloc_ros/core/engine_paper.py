@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from limbloc_ros.core import anchors as anchor
 from limbloc_ros.core import limb_search as limbs
 from limbloc_ros.core.anchors import Grid, Head, Limb
-from limbloc_ros.core.figure import N_PARTS, PART_NAMES, FigureState, place
+from limbloc_ros.core.figure import PART_NAMES, FigureState, place
 from limbloc_ros.core.geodesic import Maxima, centre_of_mass, geodesic_map, wide_maxima
 from limbloc_ros.core.hull import Hull
-from limbloc_ros.core.paper_energy import Block, PaperEnergy, PaperTerms, block_of
+from limbloc_ros.core.paper_energy import Block, PaperEnergy, PaperTerms, block_of, stage_of
 from limbloc_ros.core.surface import Surface, curvature_variability, extract_surface
 
 Array = NDArray[np.float64]
@@ -33,6 +33,8 @@ _TORSO_ROWS: list[dict[str, float]] = [
     {"shape_0": 0.05},
 ]
 TORSO = block_of("torso", _TORSO_ROWS)
+#: Before the limbs are there, only the head tells the size: a torso alone would grow to fill a stout hull.
+TORSO_POSE = block_of("torso", _TORSO_ROWS[:-1])
 SIZES = block_of("sizes", [{"shape_0": 0.04}, *({f"shape_{k}": 0.7} for k in (1, 2, 3, 4))])
 
 
@@ -49,10 +51,14 @@ def _limb_block(kind: str, side: str) -> Block:
 
 #: A reading whose energy is higher than this is probably wrong: more heads are tried.
 DOUBTFUL = 0.36
+#: So many pairs of limbs are posed and compared by their energy.
+PAIRS = 30
+#: How much a limb's gain in the search counts against the energy of the posed figure.
+TRUST = 0.2
+#: Legs that gain less than this per voxel make other sizes be tried.
+POOR = 0.25
 LIMBS = {(kind, side): _limb_block(kind, side) for kind in ("leg", "arm") for side in "LR"}
-_PARTS_OF_TORSO = np.array([p for p in range(N_PARTS) if PART_NAMES[p] in anchor.TORSO_PARTS])
-_PARTS_OF_LEGS = np.array([p for p in range(N_PARTS) if PART_NAMES[p][:-2] in ("thigh", "shin", "foot")])
-_WITH_LEGS = np.union1d(_PARTS_OF_TORSO, _PARTS_OF_LEGS)
+WITH_TORSO, WITH_LEGS, WITH_ALL = stage_of(), stage_of("leg"), stage_of("leg", "arm")
 
 
 @dataclass(frozen=True)
@@ -99,7 +105,7 @@ def fit_state(hull: Hull) -> tuple[Branch, Description]:
     seen = describe(hull)
     grid = Grid.of(hull)
     heads = anchor.find_heads(grid, seen.surface, seen.patch_curvature, seen.centre_of_mass)
-    likely = [head for head in heads if head.explained >= 0.85]
+    likely = [head for head in heads[:2] if head.explained >= 0.85]
     best = _from_heads(grid, likely, seen)
     if best.terms.total > DOUBTFUL and len(likely) < len(heads):
         best = _best([best, _from_heads(grid, heads[len(likely) :], seen)], 1)[0]
@@ -110,7 +116,7 @@ def _from_heads(grid: Grid, heads: list[Head], seen: Description) -> Branch:
     """The best reading of the hull that starts from one of these heads (sections 2.3 and 2.4)."""
     cues = limbs.cues_of(grid, seen.surface, seen.patch_curvature, seen.maxima)
     branches = [branch for head in heads for branch in _torsos(grid, head, seen)]
-    branches = [_add_limbs(grid, branch, "leg", cues) for branch in branches]
+    branches = [_add_legs(grid, branch, cues) for branch in _best(branches, 6)]
     branches = [_add_limbs(grid, branch, "arm", cues) for branch in _best(branches, 3)]
     branches = [_refine(branch, 1) for branch in _best(branches, 2)]
     return _best(branches, 1)[0]
@@ -120,25 +126,48 @@ def _torsos(grid: Grid, head: Head, seen: Description) -> list[Branch]:
     energy = PaperEnergy(grid.hull, head.radius / anchor.HEAD_RADIUS)
     out = []
     for torso in anchor.find_torsos(grid, head, seen.centre_of_mass, 2):
-        state, _ = energy.refine(torso.state, TORSO, 160, only=_PARTS_OF_TORSO)
-        out.append(Branch(head, state, energy, energy.terms(state, _PARTS_OF_TORSO), {}))
+        state, _ = energy.refine(torso.state, TORSO_POSE, 160, WITH_TORSO)
+        out.append(Branch(head, state, energy, energy.terms(state, WITH_TORSO), {}))
     return out
 
 
+def _add_legs(grid: Grid, branch: Branch, cues: limbs.Cues) -> Branch:
+    """Find both legs in what the torso leaves of the hull; legs that do not fit tell that the head misled on the size."""
+    found = _add_limbs(grid, branch, "leg", cues)
+    if min((limb.gain for limb in found.limbs.values()), default=-1.0) >= POOR:
+        return found
+    resized = [_add_limbs(grid, replace(branch, state=_resized(branch, scale)), "leg", cues) for scale in (0.88, 1.1)]
+    return min([found, *resized], key=lambda b: _judged(b, "leg"))
+
+
+def _resized(branch: Branch, scale: float) -> FigureState:
+    """The figure made larger or smaller with the head's centre in place."""
+    state = branch.state
+    shape = state.shape.copy()
+    shape[0] += np.log(scale)
+    return FigureState(branch.head.centre + scale * (state.root - branch.head.centre), state.rotations, shape)
+
+
 def _add_limbs(grid: Grid, branch: Branch, kind: str, cues: limbs.Cues) -> Branch:
-    """Find both legs or both arms in what torso (and legs) leave of the hull."""
-    present = _PARTS_OF_TORSO if kind == "leg" else _WITH_LEGS
-    flesh = place(branch.state).flesh()
-    names = tuple(PART_NAMES[p] for p in present)
-    free = grid.without(anchor.part_of(flesh, names), limbs.PRICE)
+    """Find both legs, or both arms, in what torso, or torso and legs, leave of the hull."""
+    before, after = (WITH_TORSO, WITH_LEGS) if kind == "leg" else (WITH_LEGS, WITH_ALL)
+    names = tuple(PART_NAMES[p] for p in before.parts)
+    free = grid.without(anchor.part_of(place(branch.state).flesh(), names), limbs.PRICE)
     found = {side: limbs.find_limbs(free, branch.state, kind, side, cues) for side in "LR"}
-    pair = limbs.best_pair(free, found["L"], found["R"], branch.state, kind)
-    state, points = branch.state, dict(branch.limbs)
-    for side, limb in zip("LR", pair or (), strict=False):
-        state = limbs.bend_to(state, kind, side, limb.points)
-        points[f"{kind}_{side}"] = limb
-    terms = branch.energy.terms(state, _WITH_LEGS if kind == "leg" else None)
-    return replace(branch, state=state, terms=terms, limbs=points)
+    readings = [replace(branch, terms=branch.energy.terms(branch.state, after))]
+    for pair in limbs.best_pairs(free, found["L"], found["R"], branch.state, kind, PAIRS):
+        state, points = branch.state, dict(branch.limbs)
+        for side, limb in zip("LR", pair, strict=True):
+            state = limbs.bend_to(state, kind, side, limb.points)
+            points[f"{kind}_{side}"] = limb
+        readings.append(replace(branch, state=state, terms=branch.energy.terms(state, after), limbs=points))
+    return min(readings, key=lambda b: _judged(b, kind))
+
+
+def _judged(branch: Branch, kind: str) -> float:
+    """The energy, and what the search says of the limbs: the posed figure only follows the found points roughly."""
+    gains = [limb.gain for name, limb in branch.limbs.items() if name.startswith(kind)]
+    return branch.terms.total - TRUST * (sum(gains) if gains else -2.0)
 
 
 def _refine(branch: Branch, rounds: int) -> Branch:
@@ -146,8 +175,8 @@ def _refine(branch: Branch, rounds: int) -> Branch:
     state = branch.state
     for _ in range(rounds):
         for block, budget in ((TORSO, 150), *((block, 120) for block in LIMBS.values()), (SIZES, 60)):
-            state, _result = branch.energy.refine(state, block, budget)
-    return replace(branch, state=state, terms=branch.energy.terms(state))
+            state, _result = branch.energy.refine(state, block, budget, WITH_ALL)
+    return replace(branch, state=state, terms=branch.energy.terms(state, WITH_ALL))
 
 
 def _best(branches: list[Branch], count: int) -> list[Branch]:

@@ -116,12 +116,12 @@ def find_limbs(grid: Grid, state: FigureState, kind: str, side: str, cues: Cues)
     return limbs[:KEPT_LIMBS]
 
 
-def best_pair(
-    grid: Grid, left: list[Limb], right: list[Limb], state: FigureState, kind: str
-) -> tuple[Limb, Limb] | None:
-    """The left and right limb that together explain most of the hull, each voxel counted once."""
+def best_pairs(
+    grid: Grid, left: list[Limb], right: list[Limb], state: FigureState, kind: str, count: int
+) -> list[tuple[Limb, Limb]]:
+    """The left and right limbs that together explain most of the hull, each voxel counted once; best first."""
     if not left or not right:
-        return None
+        return []
     placed = place(state)
     voxels = np.argwhere(grid.earns > 0.0).astype(np.float64)
     worth = grid.earns[grid.earns > 0.0].astype(np.float64)
@@ -139,8 +139,8 @@ def best_pair(
     shared = (masks["L"] * worth) @ masks["R"].T.astype(np.float64)
     size = float(min((masks["L"] @ worth).max(), (masks["R"] @ worth).max())) + 1e-9
     gain = np.array([x.gain for x in left])[:, None] + np.array([x.gain for x in right])[None] - 1.5 * shared / size
-    a, b = np.unravel_index(int(np.argmax(gain)), gain.shape)
-    return left[int(a)], right[int(b)]
+    order = np.argsort(-gain, axis=None, kind="stable")[:count]
+    return [(left[n // len(right)], right[n % len(right)]) for n in order.tolist()]
 
 
 def bend_to(state: FigureState, kind: str, side: str, points: Array) -> FigureState:

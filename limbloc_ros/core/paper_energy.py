@@ -19,8 +19,8 @@ from limbloc_ros.core.figure import (
     DOF_BONES,
     N_BONES,
     N_DOF,
-    N_PARTS,
     N_SPHERES,
+    PART_NAMES,
     PART_SPHERES,
     SUBTREE,
     FigureState,
@@ -34,8 +34,6 @@ from limbloc_ros.core.simplex import SimplexResult, minimise
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
 
-_BEGINS = np.array([JOINT[a] for a, b in STICK_BONES if "finger" not in b and "head_top" not in b])
-_ENDS = np.array([JOINT[b] for a, b in STICK_BONES if "finger" not in b and "head_top" not in b])
 #: Voxels along the edge of a block of neighbours.
 _BLOCK = 4
 _SPHERE_BONES = proportions().point_bones[:N_SPHERES]
@@ -47,7 +45,7 @@ class PaperWeights:
 
     Attributes:
         lengths: constraint 1, per squared standard deviation off the standard proportions and the head's scale.
-        inclusion: constraint 3, the "extra-high penalty": all bones outside the hull cost this.
+        inclusion: constraint 3, the "extra-high penalty": all bones wholly outside the hull cost this.
         limits: constraint 4, per squared rad beyond a joint's range.
         posture: constraint 4, per squared standard deviation from the middle of a joint's range; settles what the
             voxels leave open, such as the turn of a straight limb about itself.
@@ -55,7 +53,7 @@ class PaperWeights:
     """
 
     lengths: float = 0.002
-    inclusion: float = 2.0
+    inclusion: float = 0.6
     limits: float = 0.3
     posture: float = 0.0003
     penetration: float = 0.3
@@ -76,6 +74,33 @@ class PaperTerms:
     def total(self) -> float:
         """Their sum."""
         return self.overlap + self.lengths + self.inclusion + self.limits + self.posture + self.penetration
+
+
+@dataclass(frozen=True)
+class Stage:
+    """How much of the figure exists at one point of the fitting sequence.
+
+    Attributes:
+        parts: int64 [M] the flesh parts.
+        bones: int64 [N, 2] the bones of the stick figure, as pairs of joints.
+    """
+
+    parts: Rows
+    bones: Rows
+
+
+def stage_of(*limbs: str) -> Stage:
+    """Head and torso, with `leg`, `arm` or both."""
+    missing = {name for kind, names in _LIMB_PARTS.items() if kind not in limbs for name in names}
+    absent = {joint for kind, joints in _LIMB_JOINTS.items() if kind not in limbs for joint in joints}
+    absent |= {"fingertip", "head_top"}  # they only touch the surface
+    parts = [p for p, name in enumerate(PART_NAMES) if name.removesuffix("_L").removesuffix("_R") not in missing]
+    bones = [(JOINT[a], JOINT[b]) for a, b in STICK_BONES if b.removesuffix("_L").removesuffix("_R") not in absent]
+    return Stage(np.array(parts), np.array(bones))
+
+
+_LIMB_PARTS = {"leg": ("thigh", "shin", "foot"), "arm": ("upper_arm", "forearm", "hand")}
+_LIMB_JOINTS = {"leg": ("knee", "ankle", "heel", "toe"), "arm": ("elbow", "wrist", "hand")}
 
 
 @dataclass(frozen=True)
@@ -140,17 +165,20 @@ class PaperEnergy:
             )
         )
 
-    def terms(self, state: FigureState, parts: Rows | None = None, known: Array | None = None) -> PaperTerms:
+    def terms(
+        self, state: FigureState, stage: Stage, moving: Rows | None = None, known: Array | None = None
+    ) -> PaperTerms:
         """Evaluate the energy.
 
         Args:
             state: the figure.
-            parts: the flesh to look at; None: all.
-            known: [Q] distances to flesh that stays (`known`), None: there is none.
+            stage: what of it exists.
+            moving: the flesh parts to look at, if the distances to all others are `known`.
+            known: [Q] distances to the flesh that stays.
         """
         w = self.weights
         placed = place(state)
-        flesh = PART_SPHERES if parts is None else PART_SPHERES[parts]
+        flesh = PART_SPHERES[stage.parts if moving is None else moving]
         xor = kernels.soft_xor(
             self.query,
             self.blocks,
@@ -163,7 +191,12 @@ class PaperEnergy:
             placed.radii,
         )
         outside = kernels.bones_outside(
-            self.sdf, self.origin, self.voxel_m, placed.joints[_BEGINS], placed.joints[_ENDS], 2 * self.voxel_m
+            self.sdf,
+            self.origin,
+            self.voxel_m,
+            placed.joints[stage.bones[:, 0]],
+            placed.joints[stage.bones[:, 1]],
+            2 * self.voxel_m,
         )
         angles = kernels.angles_from_rest(state.rotations, REST_ROTATIONS, DOF_BONES, DOF_AXES)
         beyond = np.maximum(0.0, angles - HIGH) + np.maximum(0.0, LOW - angles)
@@ -180,7 +213,7 @@ class PaperEnergy:
         )
 
     def refine(
-        self, state: FigureState, block: Block, evaluations: int, only: Rows | None = None
+        self, state: FigureState, block: Block, evaluations: int, stage: Stage
     ) -> tuple[FigureState, SimplexResult]:
         """Minimise over one block with the improved Nelder-Mead (section 2.5).
 
@@ -188,14 +221,13 @@ class PaperEnergy:
             state: where to start.
             block: what moves.
             evaluations: the budget.
-            only: the flesh that exists at this stage; None: all.
+            stage: what of the figure exists.
         """
-        present = np.arange(N_PARTS) if only is None else only
-        moving = np.intersect1d(block.parts, present)
-        known = self.known(state, np.setdiff1d(present, moving))
+        moving = np.intersect1d(block.parts, stage.parts)
+        known = self.known(state, np.setdiff1d(stage.parts, moving))
 
         def value(x: Array) -> float:
-            return self.terms(state.moved(x @ block.steps), moving, known).total
+            return self.terms(state.moved(x @ block.steps), stage, moving, known).total
 
         result = minimise(
             value,
