@@ -27,7 +27,7 @@ EPILOG = """\
 examples:
   limbloc demo
   limbloc demo --seconds 10 --cameras 4 --person child
-  limbloc demo --domain 42        and beside it: ROS_DOMAIN_ID=42 rviz2 -d config/smart_space.rviz
+  limbloc demo --domain 42        and beside it: ROS_DOMAIN_ID=42 rviz2 -d config/limbloc.rviz
 """
 
 #: Without a pose after this long something is wrong, s. The background is learned first.
