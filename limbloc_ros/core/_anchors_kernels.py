@@ -102,9 +102,9 @@ def frustum_gain(
                     if (x - q * px) ** 2 + (y - q * py) ** 2 + (z - q * pz) ** 2 < r2 * r2:
                         total -= share * price
                         continue
-            i = int(math.floor(a[0] + x + 0.5))
-            j = int(math.floor(a[1] + y + 0.5))
-            k = int(math.floor(a[2] + z + 0.5))
+            i = math.floor(a[0] + x + 0.5)
+            j = math.floor(a[1] + y + 0.5)
+            k = math.floor(a[2] + z + 0.5)
             if 0 <= i < nx and 0 <= j < ny and 0 <= k < nz:
                 total += share * weight[i, j, k]
             else:
@@ -153,7 +153,7 @@ def cover_frustum(
 
 @njit(cache=True)
 def template_scores(weight: Grid, centre: Array, templates: Array, rotations: Array) -> Array:
-    """Sum of `weight` over the points of each template [T, S, 3] (voxels) turned by each rotation [R, 3, 3] about `centre`."""
+    """[T, R] sum of `weight` over each template's points [T, S, 3] (voxels), turned by each rotation."""
     nx, ny, nz = weight.shape
     out = np.empty((templates.shape[0], rotations.shape[0]))
     for r in range(rotations.shape[0]):

@@ -68,7 +68,7 @@ def pack_parts(parts: Any, points: Any, radii: Any) -> Any:
 
 
 @njit(cache=True, inline="always")  # type: ignore[misc, unused-ignore]
-def _edge(x: float, y: float, z: float, table: Any, p: int, e: int) -> float:
+def _edge(x: float, y: float, z: float, table: Any, p: int, e: int) -> Any:
     a, b = 5 + 4 * e, 5 + 4 * ((e + 1) % 3)
     qx, qy, qz = x - table[p, a], y - table[p, a + 1], z - table[p, a + 2]
     g = table[p, 18 + 2 * e]
@@ -92,7 +92,7 @@ def _edge(x: float, y: float, z: float, table: Any, p: int, e: int) -> float:
 
 
 @njit(cache=True)  # type: ignore[misc, unused-ignore]
-def packed_distance(x: float, y: float, z: float, table: Any, p: int) -> float:
+def packed_distance(x: float, y: float, z: float, table: Any, p: int) -> Any:
     """Signed distance (m) to part `p` of `pack_parts`; equal to `_figure_kernels.part_distance`."""
     if table[p, 0] == 1.0:
         qx, qy, qz = x - table[p, 5], y - table[p, 6], z - table[p, 7]

@@ -107,13 +107,14 @@ class Grid:
         """The inverse of `local`."""
         return np.asarray((p_local + 0.5 + np.asarray(self.hull.index_min)) * self.hull.voxel_m)
 
-    def without(self, flesh: Flesh, price: float) -> Grid:
-        """The grid once `flesh` explains its voxels: they then cost `price` instead of earning."""
+    def without(self, flesh: Flesh, price: float, contact_m: float = 0.0) -> Grid:
+        """The grid once `flesh` explains its voxels: they then cost `price`, nothing down to a depth of `contact_m`."""
         inside = np.argwhere(self.hull.sdf < 0)
         distance, _ = flesh_distance(self.world(inside.astype(np.float64)), flesh)
-        taken = inside[distance < 0]
         earns = self.earns.copy()
-        earns[taken[:, 0], taken[:, 1], taken[:, 2]] = -price
+        for depth, worth in ((0.0, 0.0), (contact_m, -price)):
+            i, j, k = inside[distance < -depth].T
+            earns[i, j, k] = worth
         return Grid(self.hull, earns)
 
 
@@ -133,7 +134,10 @@ def find_heads(
         surface: its surface.
         patch_curvature: [N] rad, mean curvature over patches (`curvature_variability`): heads lie in its upper half.
         centre_of_mass: [3] m.
-        count: how many to return at most, best first.
+        count: how many to return at most.
+
+    Returns:
+        best first; none where no torso fits below any sphere.
     """
     curved = patch_curvature >= np.median(patch_curvature)
     points, normals = surface.points[curved], surface.normals[curved]
@@ -157,8 +161,10 @@ def find_heads(
     explained = np.array(
         [_torso_scores(grid, head, centre_of_mass, _PLAIN)[0].max() * head.radius**3 for head in found]
     )
+    if len(found) == 0 or explained.max() <= 0.0:
+        return []
     order = np.argsort(-explained, kind="stable")
-    return [replace(found[n], explained=float(explained[n] / max(explained[order[0]], 1e-9))) for n in order]
+    return [replace(found[n], explained=float(explained[n] / explained.max())) for n in order]
 
 
 # --- torso ------------------------------------------------------------------------------------------------------------

@@ -16,10 +16,12 @@ from numpy.typing import NDArray
 from limbloc_ros.core import anchors as anchor
 from limbloc_ros.core import limb_search as limbs
 from limbloc_ros.core.anchors import Grid, Head, Limb
+from limbloc_ros.core.errors import NoPerson
 from limbloc_ros.core.figure import PART_NAMES, FigureState, place
 from limbloc_ros.core.geodesic import Maxima, centre_of_mass, geodesic_map, wide_maxima
 from limbloc_ros.core.hull import Hull
 from limbloc_ros.core.paper_energy import Block, PaperEnergy, PaperTerms, block_of, stage_of
+from limbloc_ros.core.pose import Flesh
 from limbloc_ros.core.surface import Surface, curvature_variability, extract_surface
 
 Array = NDArray[np.float64]
@@ -55,6 +57,8 @@ DOUBTFUL = 0.36
 PAIRS = 30
 #: How much a limb's gain in the search counts against the energy of the posed figure.
 TRUST = 0.2
+#: An arm in contact may share this much of the torso's or legs' outermost flesh.
+CONTACT_M = 0.05
 #: Legs that gain less than this per voxel make other sizes be tried.
 POOR = 0.25
 LIMBS = {(kind, side): _limb_block(kind, side) for kind in ("leg", "arm") for side in "LR"}
@@ -100,11 +104,21 @@ def describe(hull: Hull) -> Description:
     return Description(surface, centre_of_mass(hull), geodesic, mean, deviation, wide_maxima(surface, geodesic, 0.10))
 
 
-def fit_state(hull: Hull) -> tuple[Branch, Description]:
-    """The fitting sequence: head, torso, legs, arms, then everything at once."""
+def fit_state(hull: Hull) -> tuple[Branch, Description] | NoPerson:
+    """The fitting sequence: head, torso, legs, arms, then everything at once.
+
+    Args:
+        hull: the visual hull of one person, one frame.
+
+    Returns:
+        the reading of the hull with the lowest energy and what section 2.1 computes from the hull, or why there is
+        none. A poor reading is no error: its energy says so.
+    """
     seen = describe(hull)
     grid = Grid.of(hull)
     heads = anchor.find_heads(grid, seen.surface, seen.patch_curvature, seen.centre_of_mass)
+    if not heads:
+        return NoPerson("no sphere of a head's size with a torso below it fits into the hull")
     likely = [head for head in heads[:2] if head.explained >= 0.85]
     best = _from_heads(grid, likely, seen)
     if best.terms.total > DOUBTFUL and len(likely) < len(heads):
@@ -132,7 +146,7 @@ def _torsos(grid: Grid, head: Head, seen: Description) -> list[Branch]:
 
 
 def _add_legs(grid: Grid, branch: Branch, cues: limbs.Cues) -> Branch:
-    """Find both legs in what the torso leaves of the hull; legs that do not fit tell that the head misled on the size."""
+    """Find both legs in what the torso leaves; legs that do not fit tell that the head misled on the size."""
     found = _add_limbs(grid, branch, "leg", cues)
     if min((limb.gain for limb in found.limbs.values()), default=-1.0) >= POOR:
         return found
@@ -152,8 +166,11 @@ def _add_limbs(grid: Grid, branch: Branch, kind: str, cues: limbs.Cues) -> Branc
     """Find both legs, or both arms, in what torso, or torso and legs, leave of the hull."""
     before, after = (WITH_TORSO, WITH_LEGS) if kind == "leg" else (WITH_LEGS, WITH_ALL)
     names = tuple(PART_NAMES[p] for p in before.parts)
-    free = grid.without(anchor.part_of(place(branch.state).flesh(), names), limbs.PRICE)
+    flesh = anchor.part_of(place(branch.state).flesh(), names)
+    free = grid.without(flesh, limbs.PRICE)
     found = {side: limbs.find_limbs(free, branch.state, kind, side, cues) for side in "LR"}
+    if kind == "arm":
+        found = {side: _with_contact(grid, flesh, branch.state, side, cues, arms) for side, arms in found.items()}
     readings = [replace(branch, terms=branch.energy.terms(branch.state, after))]
     for pair in limbs.best_pairs(free, found["L"], found["R"], branch.state, kind, PAIRS):
         state, points = branch.state, dict(branch.limbs)
@@ -162,6 +179,16 @@ def _add_limbs(grid: Grid, branch: Branch, kind: str, cues: limbs.Cues) -> Branc
             points[f"{kind}_{side}"] = limb
         readings.append(replace(branch, state=state, terms=branch.energy.terms(state, after), limbs=points))
     return min(readings, key=lambda b: _judged(b, kind))
+
+
+def _with_contact(
+    grid: Grid, flesh: Flesh, state: FigureState, side: str, cues: limbs.Cues, arms: list[Limb]
+) -> list[Limb]:
+    """The contact rule (section 2.4): an arm that shows nowhere else is assumed to lie against torso or legs."""
+    if arms and arms[0].gain >= limbs.FUSED_BELOW:
+        return arms
+    touching = limbs.find_limbs(grid.without(flesh, limbs.PRICE, CONTACT_M), state, "arm", side, cues)
+    return arms + [replace(limb, fused=True) for limb in touching]
 
 
 def _judged(branch: Branch, kind: str) -> float:

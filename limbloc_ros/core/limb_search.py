@@ -246,8 +246,8 @@ def _hinge_limits(first: Array, forward: Array, seconds: Array, kind: str) -> Ar
     toward = bend @ forward / np.maximum(size, 1e-9)
     overbent = np.maximum(0.0, -(seconds @ first) - 0.85) * 4
     if kind == "leg":
-        return size * np.maximum(0.0, toward + 0.5) + overbent
-    return 0.5 * size * np.maximum(0.0, -toward - 0.3) + overbent
+        return np.asarray(size * np.maximum(0.0, toward + 0.5) + overbent)
+    return np.asarray(0.5 * size * np.maximum(0.0, -toward - 0.3) + overbent)
 
 
 def _forward_of(direction: Array) -> Array:

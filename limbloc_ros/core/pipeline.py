@@ -61,9 +61,11 @@ class PoseEstimator:
         """Fit the figure to one hull."""
         clock = _Stopwatch()
         if self.config.engine == "paper":
-            branch, _ = engine_paper.fit_state(hull)
+            found = engine_paper.fit_state(hull)
             clock.lap("fit")
-            return describe_pose(branch.state, hull, None, clock.stage_ms)
+            if isinstance(found, NoPerson):
+                return found
+            return describe_pose(found[0].state, hull, None, clock.stage_ms)
         surface = extract_surface(hull)
         clock.lap("surface")
         if self.config.temporal:

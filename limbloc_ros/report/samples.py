@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from limbloc_ros.core.camera import Rig
 from limbloc_ros.core.config import HullConfig
 from limbloc_ros.core.engine_paper import fit_state
+from limbloc_ros.core.errors import NoPerson
 from limbloc_ros.core.geodesic import geodesic_map
 from limbloc_ros.core.hull import Hull, carve
 from limbloc_ros.core.pose import Array, Pose
@@ -112,7 +113,10 @@ def paper_anchors(hull: Hull) -> dict[str, Array]:
         [3] m by name: `head`, `centre_of_mass`, and of each limb found `knee_L`, `ankle_L`, `toe_L`, ... or `elbow_L`,
         `wrist_L`, `fingertip_L`, ...
     """
-    branch, seen = fit_state(hull)
+    found = fit_state(hull)
+    if isinstance(found, NoPerson):
+        return {}
+    branch, seen = found
     points = {"head": branch.head.centre, "centre_of_mass": seen.centre_of_mass}
     for name, limb in branch.limbs.items():
         kind, side = name.split("_")
