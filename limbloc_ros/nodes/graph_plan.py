@@ -31,7 +31,7 @@ NODE_SECTIONS = ("segmentation", "carving", "pose", "simulated_cameras", "replay
 STEPPED_TIMEOUT_S = 5.0
 
 #: The first start compiles the kernels, which takes a while.
-VIEWERS_TIMEOUT_S = 300.0
+READY_TIMEOUT_S = 300.0
 
 
 @dataclass(frozen=True)
@@ -142,7 +142,7 @@ class _Plan:
         names = self._names(rig_file)
         section |= {"rig_file": rig_file, "transport": c.transport}
         # The background is learnt from the empty room, so the person must not come before the other nodes are ready.
-        section.setdefault("wait_for_viewers_s", VIEWERS_TIMEOUT_S)
+        section.setdefault("wait_for_viewers_s", READY_TIMEOUT_S)
         self._add("simulated", _node("simulated_cameras", "simulated_cameras", {**section, "cameras": names}))
         return self._graph(names, rig_file, dict.fromkeys(names, c.transport))
 
@@ -173,7 +173,7 @@ class _Plan:
                 )
             companions = [f"{self.namespace}/{name}/camera_info" for name in names] + [f"{self.namespace}/true_joints"]
             topics = [re.escape(t) for t in [*(s.topic for s in streams.values()), *companions] if t in bag.topics]
-        section = {"bag": c.bag, "topics": topics, **c.replay}
+        section = {"bag": c.bag, "topics": topics, "wait_for_subscribers_s": READY_TIMEOUT_S, **c.replay}
         self.sim_time = bool(section.get("clock", True))
         stepped = section.get("mode") == "stepped"
         self._add("replay", _node("replay", "replay", section), ends_graph=c.stop_with_bag)

@@ -73,13 +73,14 @@ class PoseNode(Node):
         self.outcome: Pose | NoPerson = NoPerson("no hull yet")
         self.last_stamp_ns: int | None = None
         self.meter = Meter()
+        # Before there is anything on the graph: who sees `joints` (a stepped replay) takes the node for ready.
+        self.get_logger().info("loading the kernels; the first start compiles them, which may take a minute")
+        warm_up()
         self.joints = self.create_publisher(PoseArray, topics.JOINTS, topics.STREAM_QOS)
         self.angles = self.create_publisher(JointState, topics.JOINT_ANGLES, topics.STREAM_QOS)
         self.markers = self.create_publisher(MarkerArray, topics.MARKERS, topics.STREAM_QOS)
         self.surface = self.create_publisher(PointCloud2, topics.SURFACE, topics.STREAM_QOS)
         self.body = BodyOutput(self, self.settings.body_id, self.settings.publish_tf)
-        self.get_logger().info("loading the kernels; the first start compiles them, which may take a minute")
-        warm_up()
         self.health = Health(self, self.describe)
         self.create_subscription(PointCloud2, topics.HULL, self.on_hull, topics.NEWEST_QOS)
         self.get_logger().info("ready")

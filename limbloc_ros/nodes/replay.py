@@ -218,13 +218,13 @@ class ReplayNode(Node):
         while not self._stop.is_set():
             waiting = sorted(name for name in needed if not self._outputs[name].get_subscription_count())
             if self.settings.mode == "stepped" and not self.count_publishers(self.settings.result_topic):
-                waiting.append(f"a publisher of {self.settings.result_topic}")
+                waiting.append(f"{self.settings.result_topic} (nobody publishes it)")
             if not waiting:
                 self._stop.wait(self.settings.settle_s)
                 return
             if time.monotonic() > deadline:
                 self.get_logger().warning(
-                    f"nobody listens to {', '.join(waiting)} after {self.settings.wait_for_subscribers_s:g} s; "
+                    f"no other end of {', '.join(waiting)} after {self.settings.wait_for_subscribers_s:g} s; "
                     "starting all the same"
                 )
                 return
