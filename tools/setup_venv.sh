@@ -17,7 +17,7 @@ die() {
 [ "$(uname -m)" = x86_64 ] || die "expected x86_64 (the ROS 2 wheels are built for it), this is $(uname -m); install ROS 2 by apt and see README.md"
 
 # An interpreter the ROS 2 wheels and numba exist for, the best tried first.
-usable() { command -v "$1" >/dev/null && "$1" -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 12))'; }
+usable() { command -v "$1" >/dev/null && "$1" -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 12))' 2>/dev/null; }
 find_python() {
   local name
   for name in ${PYTHON:-} python3.12 python3.11 python3; do
@@ -59,6 +59,6 @@ fi
 say "setup: Python $version and ROS 2 $ros into $venv (about a minute, 400 MB, the first time)"
 "$python" -m venv "$venv"
 # One pip run resolves all of it together; -e, so that tests and demo run what stands in the source tree.
-"$venv/bin/python" -m pip install --quiet --disable-pip-version-check -r "requirements/$ros.txt" -e '.[dev]'
+"$venv/bin/python" -m pip install -qq --disable-pip-version-check -r "requirements/$ros.txt" -e '.[dev]'
 "$venv/bin/python" -c 'import cv2, numba, rclpy' || die "the installed packages cannot be imported; remove $venv and try again"
 say "setup: done"

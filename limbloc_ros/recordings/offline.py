@@ -122,7 +122,7 @@ def prepare(say: Callable[[str], None] = lambda text: None) -> None:
     """Compile or load the kernels, once for all worker processes; when that takes long, `say` tells so."""
     cv2.setNumThreads(1)
     patience = threading.Timer(
-        4.0, say, ["loading the numeric kernels; the first run compiles them, which takes a minute"]
+        4.0, say, ["loading the numeric kernels; the first run compiles them, which takes a minute or more"]
     )
     patience.daemon = True
     patience.start()
