@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from limbloc_ros.core._figure_kernels import exp_so3, forward, part_bounds, part_distance
+from limbloc_ros.core._figure_kernels import exp_so3, forward, log_so3, part_bounds, part_distance
 
 
 @njit(cache=True, inline="always")  # type: ignore[misc, unused-ignore]
@@ -206,7 +206,7 @@ def torso_from_pairs(
                     for i in range(3):
                         for j in range(3):
                             R[i, j] = T[i, 0] * align[0, j] + T[i, 1] * align[1, j] + T[i, 2] * align[2, j]
-                    pose[3:6] = log_rotation(R)
+                    pose[3:6] = log_so3(R)
                     for i in range(3):
                         pose[i] = pelvis_seeds[a, i] - stature * (
                             R[i, 0] * axis_base[c, 0] + R[i, 1] * axis_base[c, 1] + R[i, 2] * axis_base[c, 2]
@@ -229,21 +229,6 @@ def torso_from_pairs(
                             out[worst, :13] = pose
                             out[worst, 13] = score
     return out[:count]
-
-
-@njit(cache=True)  # type: ignore[misc, unused-ignore]
-def log_rotation(R: Any) -> Any:
-    """Rotation matrix -> rotation vector; see `_figure_kernels.log_so3`."""
-    trace = R[0, 0] + R[1, 1] + R[2, 2]
-    q = np.empty(4)
-    q[0] = math.sqrt(max(0.0, 1.0 + trace)) / 2.0
-    q[1] = math.copysign(math.sqrt(max(0.0, 1.0 + R[0, 0] - R[1, 1] - R[2, 2])) / 2.0, R[2, 1] - R[1, 2])
-    q[2] = math.copysign(math.sqrt(max(0.0, 1.0 - R[0, 0] + R[1, 1] - R[2, 2])) / 2.0, R[0, 2] - R[2, 0])
-    q[3] = math.copysign(math.sqrt(max(0.0, 1.0 - R[0, 0] - R[1, 1] + R[2, 2])) / 2.0, R[1, 0] - R[0, 1])
-    n = math.sqrt(q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
-    if n < 1e-12:
-        return np.zeros(3)
-    return (2.0 * math.atan2(n, q[0]) / n) * q[1:4]
 
 
 @njit(cache=True)  # type: ignore[misc, unused-ignore]
