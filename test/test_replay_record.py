@@ -233,6 +233,21 @@ def test_masks_are_replayed_when_there_are_no_images(make, context, tmp_path):
     assert replay.published == 12
 
 
+def test_a_companion_whose_type_is_not_installed_is_left_out(make, context, tmp_path, monkeypatch):
+    with BagWriter(tmp_path / "bag") as bag:
+        bag.add_topic("/tf_static", "tf2_msgs/msg/TFMessage", latched=True)
+        bag.write("/tf_static", T0, b"\0\1\0\0" + bytes(4))
+        bag.add_topic("/cam0/image_raw", IMAGE)
+        for k in range(2):
+            bag.write("/cam0/image_raw", T0 + k, serialize_message(image(0, k)))
+    monkeypatch.setitem(sys.modules, "tf2_msgs.msg", None)  # as where only the PyPI wheels are installed
+    message_class.cache_clear()
+    replay = make(ReplayNode, bag=str(tmp_path / "bag"), wait_for_subscribers_s=0.0)
+    assert spin([replay], context, until=replay.done.is_set, timeout_s=10)
+    assert replay.error is None
+    assert "replayed 2 messages of 1 topics" in replay.summary()
+
+
 def test_damaged_messages_are_left_out_and_counted(make, context, tmp_path):
     with BagWriter(tmp_path / "bag") as bag:
         bag.add_topic("/cam0/image_raw", IMAGE)

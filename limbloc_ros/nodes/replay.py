@@ -168,13 +168,22 @@ class ReplayNode(Node):
             pattern = IMAGES if select == "images" else MASKS
             chosen = {n: t for n, t in known.items() if pattern.search(n)}
             if chosen:
-                chosen |= {n: t for n, t in known.items() if COMPANIONS.search(n)}
+                chosen |= {n: t for n, t in known.items() if COMPANIONS.search(n) and self._is_installed(t)}
         if not chosen:
             raise InputError(
                 f"{self._bag.path} has none of the wanted topics (select {self.settings.select}, topics "
                 f"{list(self.settings.topics)}); it has {', '.join(sorted(known)) or 'no topics at all'}"
             )
         return chosen
+
+    def _is_installed(self, topic: BagTopic) -> bool:
+        """Whether a companion can be published here: tf2_msgs is only part of an installed ROS."""
+        try:
+            message_class(topic.type)
+        except InputError as error:
+            self.get_logger().warning(f"{topic.name} is left out: {error}")
+            return False
+        return True
 
     def _publisher(self, topic: BagTopic) -> Publisher:
         qos = QoSProfile(
