@@ -155,13 +155,22 @@ def distance_up_to(
 
 @njit(cache=True)  # type: ignore[misc, unused-ignore]
 def soft_xor(
-    query: Any, blocks: Any, starts: Any, hull_share: Any, known: Any, width: float, parts: Any, points: Any, radii: Any
+    query: Any,
+    blocks: Any,
+    starts: Any,
+    worth: Any,
+    hull_share: Any,
+    known: Any,
+    width: float,
+    parts: Any,
+    points: Any,
+    radii: Any,
 ) -> float:
-    """Sum over voxels of |share of hull - share of flesh|; a share falls from 1 to 0 over `width` (m) at a surface."""
+    """Sum over voxels of worth * |share of hull - share of flesh|; at a surface a share falls to 0 over `width` m."""
     distance = distance_up_to(query, blocks, starts, known, 0.5 * width, parts, points, radii)
     total = 0.0
     for q in range(len(query)):
-        total += abs(hull_share[q] - (0.5 - distance[q] / width))
+        total += worth[q] * abs(hull_share[q] - (0.5 - distance[q] / width))
     return total
 
 

@@ -56,7 +56,7 @@ class PaperWeights:
     inclusion: float = 0.6
     limits: float = 0.3
     posture: float = 0.0003
-    penetration: float = 0.3
+    penetration: float = 0.1
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,9 @@ class Block:
 
 
 class PaperEnergy:
-    """Eq. 2 and the constraints for one hull; voxels on its body-centred sublattice (a quarter of all) with soft edges.
+    """Eq. 2 and the constraints for one hull, on a body-centred sublattice with soft edges.
+
+    A quarter of the voxels stands for all of them in and near the hull, and a 32nd in the empty space around it.
 
     Args:
         hull: the visual hull.
@@ -134,20 +136,35 @@ class PaperEnergy:
         self.sdf, self.voxel_m = np.ascontiguousarray(hull.sdf, dtype=np.float32), hull.voxel_m
         self.origin = (np.asarray(hull.index_min) + 0.5) * hull.voxel_m
         self.width = 1.5 * hull.voxel_m
-        near = np.argwhere(self.sdf < np.float32(2.0 * hull.voxel_m))
-        odd = (near + np.asarray(hull.index_min)) & 1
-        near = near[(odd == odd[:, :1]).all(axis=1)]  # all even or all odd
-        cell = near // _BLOCK  # neighbours together, so that the kernel can skip parts for all of them at once
-        order = np.lexsort(cell.T)
-        near, cell = near[order], cell[order]
-        self.starts = np.append(np.flatnonzero(np.append(True, (np.diff(cell, axis=0) != 0).any(axis=1))), len(near))
-        values = self.sdf[near[:, 0], near[:, 1], near[:, 2]].astype(np.float64)
-        self.query = near * hull.voxel_m + self.origin
+        close = self.sdf < np.float32(2.0 * hull.voxel_m)
+        near = self._sublattice(np.argwhere(close), np.asarray(hull.index_min))
+        far = self._sublattice(np.argwhere(~close[::2, ::2, ::2]), np.zeros(3, dtype=np.int64)) * 2
+        parts = [self._blocks(near, _BLOCK), self._blocks(far, 3 * _BLOCK)]
+        voxels = np.concatenate([part[0] for part in parts])
+        self.query = voxels * hull.voxel_m + self.origin
+        self.starts = np.concatenate([parts[0][1], parts[1][1][1:] + len(near)])
+        self.blocks = np.concatenate([part[2] for part in parts])
+        self.worth = np.where(np.arange(len(voxels)) < len(near), 1.0, 8.0)
+        values = self.sdf[tuple(voxels.T)].astype(np.float64)
         self.hull_share = np.clip(0.5 - values / self.width, 0.0, 1.0)
-        middle = (cell[self.starts[:-1]] + 0.5) * _BLOCK - 0.5
-        radius = np.full(len(middle), 0.5 * np.sqrt(3.0) * (_BLOCK - 1) * hull.voxel_m)
-        self.blocks = np.column_stack([middle * hull.voxel_m + self.origin, radius])
-        self.nothing = np.full(len(near), self.width)
+        self.nothing = np.full(len(voxels), self.width)
+
+    @staticmethod
+    def _sublattice(voxels: Rows, shift: Rows) -> Rows:
+        """Those with indices all even or all odd: a quarter of the voxels, as evenly spread as can be."""
+        odd = (voxels + shift) & 1
+        return voxels[(odd == odd[:, :1]).all(axis=1)]
+
+    def _blocks(self, voxels: Rows, edge: int) -> tuple[Rows, Rows, Array]:
+        """Neighbours together, so that the kernel can settle many of them at once: voxels, first rows, spheres."""
+        cell = voxels // edge
+        order = np.lexsort(cell.T)
+        voxels, cell = voxels[order], cell[order]
+        fresh = np.append(True, (np.diff(cell, axis=0) != 0).any(axis=1)) if len(cell) else np.zeros(0, dtype=np.bool_)
+        starts = np.append(np.flatnonzero(fresh), len(voxels))
+        middle = (cell[starts[:-1]] + 0.5) * edge - 0.5
+        radius = np.full(len(middle), 0.5 * np.sqrt(3.0) * (edge - 1) * self.voxel_m)
+        return voxels, starts, np.column_stack([middle * self.voxel_m + self.origin, radius])
 
     def known(self, state: FigureState, parts: Rows) -> Array:
         """[Q] distances to `parts`, to be kept while others move."""
@@ -183,6 +200,7 @@ class PaperEnergy:
             self.query,
             self.blocks,
             self.starts,
+            self.worth,
             self.hull_share,
             self.nothing if known is None else known,
             self.width,
@@ -205,7 +223,7 @@ class PaperEnergy:
         size = ((state.shape[0] - self.log_stature) / 0.10) ** 2 + float(state.shape[1:] @ state.shape[1:])
         return PaperTerms(
             overlap=float(xor / max(self.hull_share.sum(), 1.0)),
-            lengths=w.lengths * size,
+            lengths=float(w.lengths * size),
             inclusion=w.inclusion * float(outside),
             limits=w.limits * float(beyond @ beyond),
             posture=w.posture * float(scaled.sum()),

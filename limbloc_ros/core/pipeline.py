@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from limbloc_ros.core import engine_paper, engine_robust
 from limbloc_ros.core.camera import Camera, Rig
-from limbloc_ros.core.config import FitConfig, HullConfig, validated
 from limbloc_ros.core.confidence import describe_pose
+from limbloc_ros.core.config import FitConfig, HullConfig, validated
 from limbloc_ros.core.errors import NoPerson
 from limbloc_ros.core.hull import Hull, carve_silhouettes
 from limbloc_ros.core.pose import Pose
