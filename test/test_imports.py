@@ -44,11 +44,13 @@ CORE_ORDER = (
     "paper_energy",
     "anchors",
     "limb_search",
+    "search",
     "engine_paper",
     "engine_robust",
     "tracking",
     "joint_angles",
     "ros4hri",
+    "confidence",
     "pipeline",
 )
 
