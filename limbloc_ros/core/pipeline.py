@@ -59,6 +59,8 @@ class PoseEstimator:
 
     def estimate(self, hull: Hull) -> Pose | NoPerson:
         """Fit the figure to one hull."""
+        if hull.inside_count == 0:
+            return NoPerson("the hull holds no voxel: is anybody in the carve volume?")
         clock = _Stopwatch()
         if self.config.engine == "paper":
             found = engine_paper.fit_state(hull)

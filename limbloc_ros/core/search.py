@@ -119,6 +119,8 @@ def torso_hypotheses(hull: Hull, medial: Medial, rng: np.random.Generator, keep:
     """
     table = _torso_table()
     points = medial.points
+    if len(points) == 0:
+        return []
     by_depth = np.argsort(-points[:, 3], kind="stable")
     trunk = by_depth[points[by_depth, 3] > max(0.04, 0.4 * points[:, 3].max())]
     pelvis = points[kernels.spread_out(points, trunk, 0.07, 40)]
