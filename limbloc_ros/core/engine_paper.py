@@ -130,8 +130,9 @@ def _from_heads(grid: Grid, heads: list[Head], seen: Description) -> Branch:
     """The best reading of the hull that starts from one of these heads (sections 2.3 and 2.4)."""
     cues = limbs.cues_of(grid, seen.surface, seen.patch_curvature, seen.maxima)
     branches = [branch for head in heads for branch in _torsos(grid, head, seen)]
-    branches = [_add_legs(grid, branch, cues) for branch in _best(branches, 6)]
-    branches = [_add_limbs(grid, branch, "arm", cues) for branch in _best(branches, 3)]
+    branches = [_add_limbs(grid, branch, "leg", cues) for branch in _best(branches, 6)]
+    branches = [_fit_size(grid, branch, cues) for branch in _best(branches, 3)]
+    branches = [_add_limbs(grid, branch, "arm", cues) for branch in branches]
     branches = [_refine(branch, 1) for branch in _best(branches, 2)]
     return _best(branches, 1)[0]
 
@@ -145,13 +146,12 @@ def _torsos(grid: Grid, head: Head, seen: Description) -> list[Branch]:
     return out
 
 
-def _add_legs(grid: Grid, branch: Branch, cues: limbs.Cues) -> Branch:
-    """Find both legs in what the torso leaves; legs that do not fit tell that the head misled on the size."""
-    found = _add_limbs(grid, branch, "leg", cues)
-    if min((limb.gain for limb in found.limbs.values()), default=-1.0) >= POOR:
-        return found
-    resized = [_add_limbs(grid, replace(branch, state=_resized(branch, scale)), "leg", cues) for scale in (0.88, 1.1)]
-    return min([found, *resized], key=lambda b: _judged(b, "leg"))
+def _fit_size(grid: Grid, branch: Branch, cues: limbs.Cues) -> Branch:
+    """Try a smaller and a larger figure too: legs that fit badly tell that the head misled on the size."""
+    if branch.limbs and min(limb.gain for limb in branch.limbs.values()) >= POOR:
+        return branch
+    bare = [replace(branch, state=_resized(branch, scale), limbs={}) for scale in (0.88, 1.1)]
+    return min([branch, *(_add_limbs(grid, b, "leg", cues) for b in bare)], key=lambda b: _judged(b, "leg"))
 
 
 def _resized(branch: Branch, scale: float) -> FigureState:

@@ -153,7 +153,7 @@ class PaperEnergy:
     def _sublattice(voxels: Rows, shift: Rows) -> Rows:
         """Those with indices all even or all odd: a quarter of the voxels, as evenly spread as can be."""
         odd = (voxels + shift) & 1
-        return voxels[(odd == odd[:, :1]).all(axis=1)]
+        return np.asarray(voxels[(odd == odd[:, :1]).all(axis=1)], dtype=np.int64)
 
     def _blocks(self, voxels: Rows, edge: int) -> tuple[Rows, Rows, Array]:
         """Neighbours together, so that the kernel can settle many of them at once: voxels, first rows, spheres."""
