@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from limbloc_ros.core import figure, search
 from limbloc_ros.core.figure import BONE, FigureState, place
 from limbloc_ros.core.hull import Hull
-from limbloc_ros.core.search import ARM, LEG, Limbs, Medial, kernels
+from limbloc_ros.core.search import ARM, LEG, Limbs, Medial, kernels, limb_kernels
 
 VOXEL, BAND = 0.02, 0.06
 
@@ -32,7 +32,7 @@ def flesh_hull(state):
     """The hull that ideal cameras would carve of a figure."""
     placed = place(state)
     flesh = placed.flesh()
-    low, high = placed.spheres.min(axis=0) - 0.25, placed.spheres.max(axis=0) + 0.25
+    low, high = placed.spheres.min(axis=0) - 0.16, placed.spheres.max(axis=0) + 0.16
     return hull_where(lambda points: figure.flesh_distance(points, flesh)[0], low, high)
 
 
@@ -152,7 +152,7 @@ def test_popcount():
     left = np.array([[0.0, 0, 0, 0, 0, 0, 0]])
     for value in values:
         bits = np.array([[value]], np.uint64)
-        pairs = kernels.best_pairs(left, left + 9, bits, bits, np.zeros(1, np.uint64), 64, 0.0, 0.1, 1)
+        pairs = limb_kernels.best_pairs(left, left + 9, bits, bits, np.zeros(1, np.uint64), 64, 0.0, 0.1, 1)
         assert pairs[0, 2] == pytest.approx(1 - value.bit_count() / 64)
 
 
@@ -173,7 +173,7 @@ def test_best_pairs_by_brute_force():
             expected.append((cost, a, b))
     expected.sort()
     bits = [np.array([bits_of(row) for row in f]) for f in flags]
-    pairs = kernels.best_pairs(left, right, *bits, bits_of(taken), 150, trade, apart, 10)
+    pairs = limb_kernels.best_pairs(left, right, *bits, bits_of(taken), 150, trade, apart, 10)
     assert len(pairs) == 10
     for (a, b, cost), (best, i, j) in zip(pairs, expected, strict=False):
         assert (a, b) == (i, j)
@@ -193,22 +193,11 @@ def test_samples_near_a_limb_by_brute_force():
         t = np.clip((samples - chain[s]) @ along / (along @ along), 0, 1)
         off = np.linalg.norm(samples - chain[s] - t[:, None] * along, axis=1)
         near |= off < thick[s] + t * (thick[s + 1] - thick[s]) + 0.02
-    bits = kernels.covered_by_limb(limb, base, radii, tip, samples, 0.02)
+    bits = limb_kernels.covered_by_limb(limb, base, radii, tip, samples, 0.02)
     assert bits.dtype == np.uint64
     assert len(bits) == 4
     assert 10 < near.sum() < 150
     np.testing.assert_array_equal(bits, bits_of(near))
-
-
-def test_rotation_vectors_of_headings():
-    rng = np.random.default_rng(5)
-    for R in Rotation.random(50, rng=rng).as_matrix():
-        np.testing.assert_allclose(Rotation.from_rotvec(kernels.log_so3(R)).as_matrix(), R, atol=1e-9)
-    np.testing.assert_array_equal(kernels.log_so3(np.eye(3)), np.zeros(3))
-    for axis in ([0, 0, 1], [0, 1, 0], [1, 1, 0], [1, -1, 0], [-1, 2, 2]):
-        n = np.array(axis) / np.linalg.norm(axis)
-        half_turn = 2 * np.outer(n, n) - np.eye(3)
-        np.testing.assert_allclose(Rotation.from_rotvec(kernels.log_so3(half_turn)).as_matrix(), half_turn, atol=1e-7)
 
 
 def test_directions_cover_the_sphere_evenly():
@@ -341,14 +330,14 @@ def test_no_candidates_no_pairs():
 
 def test_explained_volume_worked_by_hand():
     hull = hull_where(lambda p: np.full(len(p), -1.0), [-0.2] * 3, [0.2] * 3)
-    grid = kernels.explained_grid(
+    grid = limb_kernels.explained_grid(
         hull.sdf, hull.origin_m, VOXEL, 2, np.zeros((1, 3), np.int64), np.array([[0.01, 0.01, 0.01]]), np.array([0.1])
     )
     assert grid.shape == (10, 10, 10)
     cells = hull.origin_m + 2 * VOXEL * np.indices(grid.shape).reshape(3, -1).T
     depth = 0.1 - np.linalg.norm(cells - 0.01, axis=1)
     np.testing.assert_allclose(grid.ravel(), np.clip(depth / 0.05, 0, 1), atol=1e-6)
-    inside = kernels.explained_fraction(grid, hull.origin_m, 2 * VOXEL, 0.0, 0.0, 0.0, 0.02, 0.0, 0.0, 0.0)
+    inside = limb_kernels.explained_fraction(grid, hull.origin_m, 2 * VOXEL, 0.0, 0.0, 0.0, 0.02, 0.0, 0.0, 0.0)
     assert inside == pytest.approx(1.0)
-    outside = kernels.explained_fraction(grid, hull.origin_m, 2 * VOXEL, 0.5, 0.5, 0.5, 0.9, 0.5, 0.5, 0.0)
+    outside = limb_kernels.explained_fraction(grid, hull.origin_m, 2 * VOXEL, 0.5, 0.5, 0.5, 0.9, 0.5, 0.5, 0.0)
     assert outside == 0.0

@@ -14,7 +14,9 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from limbloc_ros.core import _limb_kernels as limb_kernels
 from limbloc_ros.core import _search_kernels as kernels
+from limbloc_ros.core import _torso_kernels as torso_kernels
 from limbloc_ros.core import figure
 from limbloc_ros.core._figure_kernels import exp_so3
 from limbloc_ros.core._figure_topology import SPHERES
@@ -127,7 +129,7 @@ def torso_hypotheses(hull: Hull, medial: Medial, rng: np.random.Generator, keep:
     heads = by_depth[(points[by_depth, 3] > 0.045) & (points[by_depth, 3] < 0.16)]
     skull = points[kernels.spread_out(points, heads, 0.05, 90)]
     evidence = (hull.sdf, hull.origin_m, hull.voxel_m)
-    found = kernels.torso_from_pairs(
+    found = torso_kernels.torso_from_pairs(
         pelvis, skull, table.axis_base, table.axis_tip, table.bends, 6, 0.30, 0.95,
         *evidence, table.arrays, table.weights, table.n_solid, 400,
     )  # fmt: skip
@@ -139,7 +141,7 @@ def torso_hypotheses(hull: Hull, medial: Medial, rng: np.random.Generator, keep:
     for start in _distinct(found, 14, 0.10, 0.4):
         noise = rng.standard_normal((120, 13))
         climbed.append(
-            kernels.climb_torso(start, noise, *evidence, table.arrays, table.weights, table.n_solid, spread)
+            torso_kernels.climb_torso(start, noise, *evidence, table.arrays, table.weights, table.n_solid, spread)
         )
     ranked = np.array(climbed)
     ranked = ranked[np.argsort(ranked[:, 13], kind="stable")]
@@ -240,7 +242,7 @@ STRIDE = 2
 
 def explained_volume(hull: Hull, placed: Placed, parts: NDArray[np.int64]) -> NDArray[np.float32]:
     """How much of the hull the figure's parts with these indices explain already, in cells of STRIDE voxels."""
-    return kernels.explained_grid(  # type: ignore[no-any-return]
+    return limb_kernels.explained_grid(  # type: ignore[no-any-return]
         hull.sdf, hull.origin_m, hull.voxel_m, STRIDE, figure.PART_SPHERES[parts], placed.spheres, placed.radii
     )
 
@@ -278,7 +280,7 @@ def limb_candidates(
     ]
     if len(near) > 500:
         near = near[:: len(near) // 500 + 1]
-    found = kernels.search_limb(
+    found = limb_kernels.search_limb(
         base, lengths, radii, tip_m, near, sphere_directions(100), hull.sdf, hull.origin_m, hull.voxel_m,
         explained, STRIDE, kind.skip, 0.04, kind.explained_weight, forbidden, keep,
     )  # fmt: skip
@@ -301,14 +303,14 @@ def limb_pairs(left: Limbs, right: Limbs, samples: Array, explained: NDArray[np.
     if len(left.found) == 0 or len(right.found) == 0:
         return []
     bits = [
-        np.array([kernels.covered_by_limb(row, limb.base, limb.radii, limb.tip_m, samples, 0.035) for row in limb.found])
+        np.array([limb_kernels.covered_by_limb(row, limb.base, limb.radii, limb.tip_m, samples, 0.035) for row in limb.found])
         for limb in (left, right)
     ]
     taken = np.zeros(bits[0].shape[1] * 64, np.uint8)
     taken[: len(samples)] = explained
     packed = np.packbits(taken, bitorder="little").view(np.uint64)
     apart = 0.25 * float(left.lengths[0])
-    pairs = kernels.best_pairs(left.found, right.found, *bits, packed, len(samples), trade, apart, keep)
+    pairs = limb_kernels.best_pairs(left.found, right.found, *bits, packed, len(samples), trade, apart, keep)
     return [(int(a), int(b), float(cost)) for a, b, cost in pairs]
 
 
