@@ -115,7 +115,7 @@ class HullConfig:
     min_cameras: int = setting(2, "fewer live masks than this give no hull", low=1, high=64, live=True)
     repair_depth_m: float = setting(
         0.04,
-        "a voxel that one camera denies stays when it lies this deep inside all other silhouettes (doubled below 6 cameras)",
+        "with six cameras or more, a voxel that one camera denies stays when this deep inside all other silhouettes",
         unit="m", low=0.0, high=1.0, live=True,
     )
     shared_veto: float = setting(
