@@ -61,7 +61,9 @@ def run(args: argparse.Namespace) -> int:
     print("\nworking out all joint angles from the recorded masks, for CSV and report")
     from limbloc_ros.cli import main
 
-    return main(["process", str(out / "bag"), "--rig", str(out / "rig.yaml"), "--out", str(out), "--report"])
+    return main(
+        ["process", str(out / "bag"), "--rig", str(out / "rig.yaml"), "--out", str(out), "--temporal", "--report"]
+    )
 
 
 def _run_live(args: argparse.Namespace, out: Path) -> None:
@@ -78,6 +80,7 @@ def _run_live(args: argparse.Namespace, out: Path) -> None:
         f"simulated_cameras.rate_hz={float(args.rate)}",
         f"simulated_cameras.person={args.person}",
         "record.images=none",  # eight raw cameras fill 70 MB a second; the masks are what the poses come from
+        "pose.fit.temporal=true",  # a figure fitted from scratch takes longer than the time between two images
         f"network.domain_id={_domain(args.domain)}",
         *args.set,
     ]
