@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Draw docs/images/model.png: flesh figure, stick figure with joint names, and a bent posture with its frames.
 
-    python tools/draw_model.py docs/images/model.png
+python tools/draw_model.py docs/images/model.png
 """
 
 from __future__ import annotations

@@ -19,7 +19,9 @@ import numpy as np
 import torch
 
 MODES = 10
-CONVERT = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # columns: our forward, left, up in Anny's axes
+CONVERT = np.array(
+    [[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
+)  # columns: our forward, left, up in Anny's axes
 
 spec = importlib.util.spec_from_file_location(
     "topology", Path(__file__).parent.parent / "limbloc_ros" / "core" / "_figure_topology.py"
@@ -184,7 +186,9 @@ def main() -> None:
         v = v - v.mean(1, keepdims=True)
         cov = np.einsum("nvi,nvj->nij", v, v) / v.shape[1]
         girth.append(np.sqrt(np.linalg.eigvalsh(cov)) / stature[:, None])
-    features = np.concatenate([offsets.reshape(len(stature), -1), joint_offsets.reshape(len(stature), -1), 2 * np.concatenate(girth, 1)], 1)
+    features = np.concatenate(
+        [offsets.reshape(len(stature), -1), joint_offsets.reshape(len(stature), -1), 2 * np.concatenate(girth, 1)], 1
+    )
     mean = features.mean(0)
     U, S, Vt = np.linalg.svd(features - mean, full_matrices=False)
     beta = U[:, :MODES] * np.sqrt(len(stature))
@@ -230,6 +234,8 @@ def main() -> None:
     log_radius = torch.tensor(np.log(radius0[:, 0]), dtype=torch.float32, requires_grad=True)
     radius_modes = torch.tensor(radius0[:, 1:], dtype=torch.float32, requires_grad=True)
     anchor_centre = centre.detach().clone()
+    # small spheres would wander along the fingers: they stay near where the hand's joints put them
+    held = torch.tensor([200.0 if SPHERES[i][1].startswith("hand") else 1.0 for i in independent])
     parts = torch.tensor([[sphere_names.index(p[min(k, len(p) - 1)]) for k in range(3)] for _, p in PARTS])
 
     def posed_frames(which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -250,7 +256,9 @@ def main() -> None:
     rest_world = np.stack([frames[b] for b in bone_names], 1)
     rest_place = np.stack([origin[b] for b in bone_names], 1)
     B = torch.tensor(design, dtype=torch.float32)
-    optimiser = torch.optim.Adam([{"params": [centre], "lr": 6e-4}, {"params": [log_radius], "lr": 8e-3}, {"params": [radius_modes], "lr": 2e-4}])
+    optimiser = torch.optim.Adam(
+        [{"params": [centre], "lr": 6e-4}, {"params": [log_radius], "lr": 8e-3}, {"params": [radius_modes], "lr": 2e-4}]
+    )
     for step in range(args.steps):
         lr_scale = 1.0 if step < 0.6 * args.steps else 0.25
         for group, lr in zip(optimiser.param_groups, (6e-4, 8e-3, 2e-4), strict=True):
@@ -267,24 +275,35 @@ def main() -> None:
         p = torch.tensor(skin[:, pick], dtype=torch.float32)
         H = torch.tensor(stature[person], dtype=torch.float32)
         local = torch.einsum("sik,nk->nsi", centre[lookup] * flip[:, :, None] * middle[:, :, None], B[person])
-        r = (log_radius.exp()[lookup] + torch.einsum("sk,nk->ns", radius_modes[lookup], B[person][:, 1:])).clamp_min(0.003)
+        r = (log_radius.exp()[lookup] + torch.einsum("sk,nk->ns", radius_modes[lookup], B[person][:, 1:])).clamp_min(
+            0.003
+        )
         W = torch.tensor(world[:, sphere_bone], dtype=torch.float32)
         O = torch.tensor(place[:, sphere_bone], dtype=torch.float32)
         c = O + torch.einsum("nsij,nsj->nsi", W, local) * H[:, None, None]
         r = r * H[:, None]
         with torch.no_grad():
             w = part_weights(p, c[:, parts], r[:, parts])
-        d = (p.unsqueeze(-2) - torch.einsum("nqpk,npki->nqpi", w, c[:, parts])).norm(dim=-1) - torch.einsum("nqpk,npk->nqp", w, r[:, parts])
+        d = (p.unsqueeze(-2) - torch.einsum("nqpk,npki->nqpi", w, c[:, parts])).norm(dim=-1) - torch.einsum(
+            "nqpk,npk->nqp", w, r[:, parts]
+        )
         d = d.min(-1).values
         surface = torch.nn.functional.huber_loss(d, torch.zeros_like(d), delta=0.015) / 0.015
         poke = (r - torch.cdist(c, p).min(-1).values).clamp_min(0).mean()
-        drift = (centre - anchor_centre)[:, :, 0].square().mean() * 3 + centre[:, :, 1:].square().mean() * 20 + radius_modes.square().mean() * 20
+        drift = (
+            ((centre - anchor_centre)[:, :, 0].square() * held[:, None]).mean() * 3
+            + centre[:, :, 1:].square().mean() * 20
+            + radius_modes.square().mean() * 20
+        )
         loss = surface + 0.5 * poke + drift
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
         if step % 50 < 2 or step == args.steps - 1:
-            print(f"{step:4d} mean |distance| {1000 * d.abs().mean().item():.1f} mm  signed {1000 * d.mean().item():+.1f}  poke {1000 * poke.item():.1f}", flush=True)
+            print(
+                f"{step:4d} mean |distance| {1000 * d.abs().mean().item():.1f} mm  signed {1000 * d.mean().item():+.1f}  poke {1000 * poke.item():.1f}",
+                flush=True,
+            )
 
     with torch.no_grad():
         centre_table = (centre[lookup] * flip[:, :, None] * middle[:, :, None]).numpy()

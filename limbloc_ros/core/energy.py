@@ -27,9 +27,9 @@ class Weights:
     """
 
     surface: float = 1.0
-    surface_width_m: float = 0.05
+    surface_width_m: float = 0.06
     surface_inside: float = 2.0
-    normal_gate_m: float = 0.03
+    normal_gate_m: float = 0.10
     inclusion: float = 0.006
     inclusion_width_m: float = 0.06
     inclusion_slack_m: float = 0.002
@@ -79,7 +79,7 @@ _RANGES: dict[str, dict[str, tuple[float, float, float]]] = {
     "clavicle": {"x": (-25, 25, 8), "z": (-25, 25, 8)},
     "upper_arm": {"x": (-100, 110, 45), "y": (-110, 90, 45), "z": (-90, 90, 35)},
     "forearm": {"y": (-150, 3, 60)},
-    "hand": {"x": (-30, 30, 10), "y": (-60, 60, 18), "z": (-90, 90, 40)},
+    "hand": {"x": (-60, 60, 18), "y": (-30, 30, 10), "z": (-90, 90, 40)},
     "thigh": {"x": (-50, 60, 18), "y": (-100, 60, 40), "z": (-45, 45, 15)},
     "shin": {"y": (-3, 150, 60)},
     "foot": {"x": (-25, 25, 10), "y": (-35, 50, 18), "z": (-25, 25, 10)},
@@ -155,12 +155,16 @@ def _penetration_pairs() -> NDArray[np.int64]:
         for p, (part, _) in enumerate(PARTS):
             base = part[:-2] if part[-2:] in ("_L", "_R") else part
             for sphere in arm:
-                if base in trunk or base in ("thigh", "shin") or (part.endswith(other) and base in ("upper_arm", "forearm")):
+                if (
+                    base in trunk
+                    or base in ("thigh", "shin")
+                    or (part.endswith(other) and base in ("upper_arm", "forearm"))
+                ):
                     pairs.append((figure.SPHERE[f"{sphere}_{side}"], p))
             for sphere in leg:
-                if part.endswith(other) and base in ("thigh", "shin", "foot"):
-                    pairs.append((figure.SPHERE[f"{sphere}_{side}"], p))
-                elif base in ("abdomen", "belly", "thorax", "chest") and sphere in ("knee", "calf"):
+                if (part.endswith(other) and base in ("thigh", "shin", "foot")) or (
+                    base in ("abdomen", "belly", "thorax", "chest") and sphere in ("knee", "calf")
+                ):
                     pairs.append((figure.SPHERE[f"{sphere}_{side}"], p))
     return np.array(pairs, np.int64)
 
@@ -175,7 +179,11 @@ def system(state: FigureState, evidence: Evidence, weights: Weights) -> System:
     (1 and, through shared sizes, 2).
     """
     table = figure.proportions()
-    points = (table.point_bones[: figure.N_SPHERES], table.point_offsets[: figure.N_SPHERES], table.point_radii[: figure.N_SPHERES])
+    points = (
+        table.point_bones[: figure.N_SPHERES],
+        table.point_offsets[: figure.N_SPHERES],
+        table.point_radii[: figure.N_SPHERES],
+    )
     origins, world, spheres, radii = figure_kernels.forward(
         state.root, state.rotations, state.shape, figure.PARENTS, table.bone_offsets, *points
     )

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,6 +23,8 @@ class Effort:
     """How much is searched; the defaults are for one frame alone."""
 
     torsos: int = 8
+    arm_pairs: int = 4
+    repairs: int = 12
     quick_points: int = 350
     quick_iterations: int = 8
     finalists: int = 5
@@ -35,9 +36,7 @@ def gather_evidence(hull: Hull, surface: Surface, points: int, rng: np.random.Ge
     """A random but even sample of the surface, and the signed distance grid."""
     rows = np.sort(rng.permutation(len(surface))[:points])
     weights = np.full(len(rows), 1.0 / len(rows))
-    return Evidence(
-        surface.points[rows], surface.normals[rows], weights, hull.sdf, hull.origin_m, hull.voxel_m
-    )
+    return Evidence(surface.points[rows], surface.normals[rows], weights, hull.sdf, hull.origin_m, hull.voxel_m)
 
 
 def refine(state: FigureState, evidence: Evidence, weights: Weights, iterations: int) -> lm.LmResult[FigureState]:
@@ -55,39 +54,48 @@ def refine(state: FigureState, evidence: Evidence, weights: Weights, iterations:
     )
 
 
+#: A surface point this near to the flesh counts as explained.
+EXPLAINED_M = 0.04
+
 _LIMB_BASES = ("upper_arm", "forearm", "hand")
 BODY_PARTS = np.array([p for p, name in enumerate(figure.PART_NAMES) if not name.startswith(_LIMB_BASES)])
 
 
-def complete_limbs(state: FigureState, hull: Hull, medial: Medial, samples: Array, pairs: int) -> list[FigureState]:
-    """Give a torso the legs and arms that together explain most of the hull."""
-    placed = figure.place(state)
-    explained = figure.kernels.flesh_distance(
-        samples, figure.PART_SPHERES[search.TRUNK_PARTS], placed.spheres, placed.radii
-    )[0] < 0.04
-    taken = search.explained_volume(hull, placed, search.UPPER_TRUNK_PARTS)
-    legs = [search.limb_candidates(hull, medial, placed, LEG, s, taken, 40) for s in "LR"]
-    leg_pairs = search.limb_pairs(legs[0], legs[1], samples, explained, 0.02, 1)
-    if leg_pairs:
-        a, b, _ = leg_pairs[0]
-        state = search.with_limb(state, placed, LEG, "L", legs[0].found[a])
-        state = search.with_limb(state, placed, LEG, "R", legs[1].found[b])
-    return complete_arms(state, hull, medial, samples, pairs)
+def with_legs(state: FigureState, hull: Hull, medial: Medial, samples: Array, pairs: int) -> list[FigureState]:
+    """The figure with each of the best pairs of legs: those that explain most of the hull beside the trunk."""
+    return _with_pairs(state, hull, medial, samples, LEG, search.TRUNK_PARTS, search.UPPER_TRUNK_PARTS, pairs)
 
 
-def complete_arms(state: FigureState, hull: Hull, medial: Medial, samples: Array, pairs: int) -> list[FigureState]:
-    """Give a figure with legs the best pairs of arms."""
+def with_arms(state: FigureState, hull: Hull, medial: Medial, samples: Array, pairs: int) -> list[FigureState]:
+    """The figure, which has legs, with each of the best pairs of arms."""
+    return _with_pairs(state, hull, medial, samples, ARM, BODY_PARTS, BODY_PARTS, pairs)
+
+
+def _with_pairs(
+    state: FigureState,
+    hull: Hull,
+    medial: Medial,
+    samples: Array,
+    kind: search.LimbKind,
+    explaining: NDArray[np.int64],
+    solid: NDArray[np.int64],
+    pairs: int,
+) -> list[FigureState]:
     placed = figure.place(state)
-    explained = figure.kernels.flesh_distance(
-        samples, figure.PART_SPHERES[BODY_PARTS], placed.spheres, placed.radii
-    )[0] < 0.035
-    taken = search.explained_volume(hull, placed, BODY_PARTS)
-    arms = [search.limb_candidates(hull, medial, placed, ARM, s, taken, 40) for s in "LR"]
+    distance, _ = figure.kernels.flesh_distance(samples, figure.PART_SPHERES[explaining], placed.spheres, placed.radii)
+    taken = search.explained_volume(hull, placed, solid)
+    left, right = (search.limb_candidates(hull, medial, placed, kind, side, taken, 40) for side in "LR")
     out = []
-    for a, b, _ in search.limb_pairs(arms[0], arms[1], samples, explained, 0.02, pairs):
-        armed = search.with_limb(state, placed, ARM, "L", arms[0].found[a])
-        out.append(search.with_limb(armed, placed, ARM, "R", arms[1].found[b]))
+    for a, b, _ in search.limb_pairs(left, right, samples, distance < EXPLAINED_M, 0.02, pairs):
+        limbed = search.with_limb(state, placed, kind, "L", left.found[a])
+        out.append(search.with_limb(limbed, placed, kind, "R", right.found[b]))
     return out or [state]
+
+
+def by_cost(states: list[FigureState], evidence: Evidence, weights: Weights, keep: int) -> list[FigureState]:
+    """The states of lowest energy as they are, before any refinement."""
+    costs = [energy.system(state, evidence, weights).cost for state in states]
+    return [states[i] for i in np.argsort(costs, kind="stable")[:keep]]
 
 
 @dataclass(frozen=True)
@@ -108,17 +116,21 @@ def fit_from_scratch(
     quick = gather_evidence(hull, surface, effort.quick_points, rng)
     full = gather_evidence(hull, surface, effort.points, rng)
     torsos = search.torso_hypotheses(hull, medial, rng, effort.torsos)
-    candidates: list[lm.LmResult[FigureState]] = []
+    starts: list[FigureState] = []
     for torso, _ in torsos:
         for facing in (torso, search.turned_about(torso)):
-            for state in complete_limbs(facing, hull, medial, quick.points, 1):
-                candidates.append(refine(state, quick, weights, effort.quick_iterations))
-    if not candidates:
+            for standing in with_legs(facing, hull, medial, quick.points, 1):
+                starts += by_cost(with_arms(standing, hull, medial, quick.points, effort.arm_pairs), quick, weights, 1)
+    if not starts:
         return None
+    candidates = [refine(state, quick, weights, effort.quick_iterations) for state in starts]
     candidates.sort(key=lambda r: r.system.cost)
-    finalists = []
+    finalists = candidates[: effort.finalists]
     for candidate in candidates[: effort.finalists]:
-        for state in (candidate.state, *complete_arms(candidate.state, hull, medial, quick.points, 2)):
+        repaired = with_arms(candidate.state, hull, medial, quick.points, effort.repairs)
+        for standing in with_legs(candidate.state, hull, medial, quick.points, 2):
+            repaired += with_arms(standing, hull, medial, quick.points, effort.repairs // 2)
+        for state in by_cost(repaired, quick, weights, 2):
             finalists.append(refine(state, quick, weights, effort.quick_iterations))
     finalists.sort(key=lambda r: r.system.cost)
     best = [refine(r.state, full, weights, effort.iterations) for r in finalists[:2]]
