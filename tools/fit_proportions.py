@@ -190,7 +190,7 @@ def main() -> None:
         [offsets.reshape(len(stature), -1), joint_offsets.reshape(len(stature), -1), 2 * np.concatenate(girth, 1)], 1
     )
     mean = features.mean(0)
-    U, S, Vt = np.linalg.svd(features - mean, full_matrices=False)
+    U, S, _ = np.linalg.svd(features - mean, full_matrices=False)
     beta = U[:, :MODES] * np.sqrt(len(stature))
     print("explained", (np.cumsum(S**2) / (S**2).sum())[: MODES + 4].round(4))
     design = np.concatenate([np.ones((len(stature), 1)), beta], 1)
@@ -224,7 +224,7 @@ def main() -> None:
     centre0 = np.zeros((len(independent), 3, 1 + MODES))
     radius0 = np.zeros((len(independent), 1 + MODES))
     for row, i in enumerate(independent):
-        _, bone, at, radius, *end = SPHERES[i]
+        _, _, at, radius, *end = SPHERES[i]
         centre0[row, :, 0] = np.array(at) / 1.75
         radius0[row, 0] = radius / 1.75
         if end:  # given as a fraction of the way to a child bone's origin
@@ -301,7 +301,8 @@ def main() -> None:
         optimiser.step()
         if step % 50 < 2 or step == args.steps - 1:
             print(
-                f"{step:4d} mean |distance| {1000 * d.abs().mean().item():.1f} mm  signed {1000 * d.mean().item():+.1f}  poke {1000 * poke.item():.1f}",
+                f"{step:4d} mean |distance| {1000 * d.abs().mean().item():.1f} mm, signed {1000 * d.mean().item():+.1f},"
+                f" poking out {1000 * poke.item():.1f}",
                 flush=True,
             )
 
