@@ -301,7 +301,8 @@ def main() -> None:
         optimiser.step()
         if step % 50 < 2 or step == args.steps - 1:
             print(
-                f"{step:4d} mean |distance| {1000 * d.abs().mean().item():.1f} mm, signed {1000 * d.mean().item():+.1f},"
+                f"{step:4d} mean |distance| {1000 * d.abs().mean().item():.1f} mm,"
+                f" signed {1000 * d.mean().item():+.1f},"
                 f" poking out {1000 * poke.item():.1f}",
                 flush=True,
             )
