@@ -129,3 +129,9 @@ def test_damaged_files(tmp_path):
     (folder / "calib.json").unlink()
     with pytest.raises(InputError, match=r"is no benchmark case: expected calib\.json and masks\.npz"):
         load_case(folder)
+
+
+def test_frames_of_the_empty_room_are_left_out():
+    case = load_case(BENCHMARK.parent / "rgb_walk")
+    assert (len(case), len(next(iter(case.truth.values()))), case.stamps[0]) == (8, 8, 0.0)
+    assert all(mask.any() for frame in range(len(case)) for mask in case.masks(frame).values())

@@ -84,6 +84,26 @@ def test_any_number_of_jobs_gives_the_same_result(case_folder, reference):
     assert counts == [(i, FRAMES) for i in range(FRAMES + 1)]
 
 
+def test_frames_left_out_give_no_rows_and_change_no_others(case_folder, reference):
+    source, kept, counts = open_source(case_folder, None, OfflineConfig()), KeptFrames(), []
+    result = process(
+        source,
+        OfflineConfig(),
+        jobs=1,
+        leave_out=2,
+        kept=kept,
+        progress=lambda done, total: counts.append((done, total)),
+    )
+    assert [f.stamp_ns for f in result.frames] == [f.stamp_ns for f in reference.frames[2:]]
+    np.testing.assert_array_equal(result.joints, reference.joints[2:])
+    assert counts == [(i, FRAMES - 2) for i in range(FRAMES - 1)]
+    assert kept.numbers == (0, 1, 2)
+    first = source.case.masks(2)
+    np.testing.assert_array_equal(kept.masks(0)["cam0"], first["cam0"])
+    with pytest.raises(InputError, match=f"{FRAMES} frames are to be left out, but the recording has only {FRAMES}"):
+        process(source, OfflineConfig(), jobs=1, leave_out=FRAMES)
+
+
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_an_interrupted_run_goes_on_where_it_stopped(case_folder, reference, tmp_path, jobs):
     source = open_source(case_folder, None, OfflineConfig())

@@ -37,6 +37,7 @@ EPILOG = """\
 examples:
   limbloc process bags/walk --rig rig.yaml --out out/walk --report
   limbloc process videos/ --rig rig.yaml --background empty_room/ --out out/balance
+  limbloc process case/rgb --rig case/calib.json --leave-out 15 --out predictions/case.npz
   limbloc process silhouettes/ --rig rig.yaml --masks --fps 60 --out out/balance
   limbloc process test/data/benchmark/public/seq_wave --out predictions/seq_wave.npz
 
@@ -67,6 +68,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "room from a recording that always shows a person who moves about",
     )
     parser.add_argument("--masks", action="store_true", help="the images or videos are silhouettes already")
+    parser.add_argument(
+        "--leave-out",
+        type=int,
+        default=0,
+        metavar="N",
+        help="no results for the first N frames, such as those of the empty room, which are learnt from all the same; "
+        "row i of the results is then frame N + i",
+    )
     parser.add_argument("--fps", type=float, metavar="HZ", help="frame rate of image folders (default: 25)")
 
 
@@ -79,6 +88,8 @@ def run(args: argparse.Namespace) -> int:
     )
     if args.jobs < 0:
         raise ConfigError(f"--jobs: expected 1 or more (0: one per core), got {args.jobs}")
+    if args.leave_out < 0:
+        raise ConfigError(f"--leave-out: expected 0 or more frames, got {args.leave_out}")
     source = open_source(
         args.input,
         load_rig(args.rig) if args.rig else None,
@@ -98,13 +109,23 @@ def run(args: argparse.Namespace) -> int:
     say(f"{source.about['kind']} {args.input}: {len(source.rig.cameras)} cameras, engine {config.fit.engine}")
     started = time.monotonic()
     offline.prepare(say)
-    with tqdm(total=source.frames, unit="frame", disable=None, dynamic_ncols=True) as bar:
+    total = None if source.frames is None else source.frames - args.leave_out
+    with tqdm(total=total, unit="frame", disable=None, dynamic_ncols=True) as bar:
 
         def progress(done: int, total: int | None) -> None:
             bar.total = total
             bar.update(done - bar.n)
 
-        result = offline.process(source, config, partial=partial, jobs=args.jobs, kept=kept, progress=progress, say=say)
+        result = offline.process(
+            source,
+            config,
+            partial=partial,
+            jobs=args.jobs,
+            leave_out=args.leave_out,
+            kept=kept,
+            progress=progress,
+            say=say,
+        )
     if only_joints:
         result.save_joints(out)
     else:

@@ -2,7 +2,8 @@
 """Benchmark case folders: calibration, packed masks and, where it is known, the truth.
 
 `calib.json` holds the cameras, `masks.npz` per camera uint8 `[F, H, ceil(W / 8)]` packed bits, `gt.npz` the true joints
-and `meta.json` what was drawn. Only the first two are needed.
+and `meta.json` what was drawn. Only the first two are needed. Where `meta.json` says `background_frames`, the masks
+begin with so many frames of the empty room, which the truth does not have: they are left out.
 """
 
 from __future__ import annotations
@@ -104,11 +105,14 @@ def load_case(folder: str | Path, rig: Rig | None = None) -> Case:
     if len(set(counts.values())) != 1:
         raise InputError(f"{folder / 'masks.npz'}: expected equally many frames of every camera, got {counts}")
     meta = _read_meta(folder / "meta.json")
-    frames = next(iter(counts.values()))
+    empty = int(meta.get("background_frames", 0))
+    frames = next(iter(counts.values())) - empty
+    if frames < 1:
+        raise InputError(f"{folder}: all {frames + empty} frames are of the empty room (background_frames {empty})")
     return Case(
         folder=folder,
         rig=rig,
-        packed={name: packed[name] for name in rig.names if name in packed},
+        packed={name: packed[name][empty:] for name in rig.names if name in packed},
         stamps=np.arange(frames) / float(meta.get("fps", DEFAULT_FPS)),
         meta=meta,
         truth=_read_truth(folder / "gt.npz", frames),
@@ -135,6 +139,8 @@ def _read_meta(path: Path) -> dict[str, Any]:
         raise InputError(f"{path}: expected an object with keys such as kind and fps, got {type(meta).__name__}")
     if not isinstance(meta.get("fps", DEFAULT_FPS), (int, float)) or meta.get("fps", DEFAULT_FPS) <= 0:
         raise InputError(f"{path}: key fps: expected a positive number, got {meta['fps']!r}")
+    if not isinstance(meta.get("background_frames", 0), int) or meta.get("background_frames", 0) < 0:
+        raise InputError(f"{path}: key background_frames: expected 0 or more, got {meta['background_frames']!r}")
     return meta
 
 

@@ -60,6 +60,7 @@ def process(
     *,
     partial: Path | None = None,
     jobs: int = 0,
+    leave_out: int = 0,
     kept: KeptFrames | None = None,
     progress: Progress = lambda done, total: None,
     say: Callable[[str], None] = lambda text: None,
@@ -72,6 +73,7 @@ def process(
         partial: folder in which finished frames are kept; the caller calls `forget_partial` once it has saved the
             run. None: nothing is kept.
         jobs: processes; 0 takes one per usable core.
+        leave_out: the first so many frames give no result; the background is learnt from them all the same.
         kept: takes a few frames with masks and images for the report.
         progress: told after each frame.
         say: told in words what a person would want to know.
@@ -84,7 +86,7 @@ def process(
         raise InputError(f"jobs: expected 0 (one per core) or more, got {jobs}")
     # A temporal frame depends on all before it, so that half a run is of no use.
     keep = partial is not None and not config.fit.temporal
-    checkpoint = Checkpoint(partial if keep else None, run_key(source, config))
+    checkpoint = Checkpoint(partial if keep else None, run_key(source, config, leave_out))
     if checkpoint.discarded:
         say(f"the unfinished run in {partial} was of other input or settings; starting anew")
     done = checkpoint.done
@@ -92,17 +94,20 @@ def process(
         say(f"going on after frame {len(done)}, where the last run was interrupted")
     if config.fit.temporal and jobs != 1:
         say("temporal: each frame starts from the one before, so one process does them all, in order")
-    jobs = 1 if config.fit.temporal else min(jobs or usable_cores(), source.frames or 10**6)
+    if source.frames is not None and leave_out >= source.frames:
+        raise InputError(f"{leave_out} frames are to be left out, but the recording has only {source.frames}")
+    total = None if source.frames is None else source.frames - leave_out
+    jobs = 1 if config.fit.temporal else min(jobs or usable_cores(), total or 10**6)
     frames = list(done)
     kept = kept if kept is not None else KeptFrames()
-    progress(len(frames), source.frames)
+    progress(len(frames), total)
     try:
-        for frame in _fitted(source, config, jobs, len(done), kept):
+        for frame in _fitted(source, config, jobs, _Part(leave_out, len(done)), kept):
             frames.append(frame)
             checkpoint.add(frame)
-            progress(len(frames), source.frames)
+            progress(len(frames), total)
     except KeyboardInterrupt:
-        raise Interrupted(_how_to_go_on(len(frames), source.frames, keep, config)) from None
+        raise Interrupted(_how_to_go_on(len(frames), total, keep, config)) from None
     except BrokenProcessPool:
         raise InputError(
             f"a worker process died after {len(frames)} frames, most likely for want of memory; "
@@ -114,7 +119,7 @@ def process(
         say(note)
     if not frames:
         raise InputError(f"{source.about['input']}: no frame could be made of it; " + "; ".join(source.notes))
-    about = {**source.about, "config": dataclasses.asdict(config), "version": __version__}
+    about = {**source.about, "left_out": leave_out, "config": dataclasses.asdict(config), "version": __version__}
     return Run(tuple(frames), about)
 
 
@@ -139,9 +144,9 @@ def forget_partial(partial: Path) -> None:
         shutil.rmtree(partial)
 
 
-def run_key(source: Source, config: OfflineConfig) -> str:
+def run_key(source: Source, config: OfflineConfig, leave_out: int = 0) -> str:
     """Fingerprint of everything that the results depend on."""
-    return fingerprint([__version__, source.identity, dataclasses.asdict(config)])
+    return fingerprint([__version__, source.identity, dataclasses.asdict(config), leave_out])
 
 
 def usable_cores() -> int:
@@ -156,6 +161,14 @@ def _how_to_go_on(done: int, total: int | None, kept: bool, config: OfflineConfi
     if config.fit.temporal:
         return text + "a temporal run starts anew, because every frame depends on all before it"
     return text + "nothing was kept"
+
+
+@dataclass(frozen=True)
+class _Part:
+    """Which frames are to be fitted: not the first `leave_out`, and of the others not the first `done`."""
+
+    leave_out: int
+    done: int
 
 
 @dataclass(frozen=True)
@@ -189,9 +202,9 @@ class _Fitter:
         return FrameResult(job.stamp_ns, outcome, stage_ms)
 
 
-def _fitted(source: Source, config: OfflineConfig, jobs: int, skip: int, kept: KeptFrames) -> Iterator[FrameResult]:
-    """Results in the order of the frames, from number `skip` on."""
-    work = _jobs(source, kept, skip)
+def _fitted(source: Source, config: OfflineConfig, jobs: int, part: _Part, kept: KeptFrames) -> Iterator[FrameResult]:
+    """Results in the order of the frames."""
+    work = _jobs(source, kept, part)
     if jobs == 1:
         cv2.setNumThreads(1)
         fitter = _Fitter(source.rig, config)
@@ -213,11 +226,13 @@ def _fitted(source: Source, config: OfflineConfig, jobs: int, skip: int, kept: K
             pool.shutdown(wait=True, cancel_futures=True)
 
 
-def _jobs(source: Source, kept: KeptFrames, skip: int) -> Iterator[_Job]:
-    """Frames from number `skip` on; those before are only looked at, because segmentation needs them."""
-    for number, frame in enumerate(source.mask_sets()):
+def _jobs(source: Source, kept: KeptFrames, part: _Part) -> Iterator[_Job]:
+    """The frames to be fitted; those before are only looked at, because segmentation needs them."""
+    for number, frame in enumerate(source.mask_sets(), start=-part.leave_out):
+        if number < 0:
+            continue
         kept.add(number, frame.masks, frame.images)
-        if number >= skip:
+        if number >= part.done:
             packed = {name: pack_mask(mask) for name, mask in frame.masks.items()}
             yield _Job(frame.stamp_ns, packed, frame.reason, frame.stage_ms)
 
