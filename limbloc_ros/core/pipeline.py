@@ -35,7 +35,8 @@ class Carver:
             masks: camera name -> uint8 [height, width], non-zero = foreground; cameras may be missing.
 
         Raises:
-            InputError: a mask has not its camera's size, or its camera is unknown.
+            InputError: a mask has not its camera's size.
+            RigError: the rig has no camera of a mask's name.
         """
         silhouettes = measure_silhouettes(masks, self.rig, self._packed, self.config)
         return carve_silhouettes(silhouettes, self.rig, self.config)

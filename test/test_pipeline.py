@@ -1,0 +1,207 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Masks to poses in one chain: what each frame gives alone, and what is carried from frame to frame."""
+
+import dataclasses
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from limbloc_ros.core.config import FitConfig, HullConfig
+from limbloc_ros.core.errors import ConfigError, InputError, NoPerson, RigError
+from limbloc_ros.core.figure import BONE_NAMES, FigureState, place
+from limbloc_ros.core.hull import Hull, carve
+from limbloc_ros.core.joint_angles import NATIVE_ANGLES
+from limbloc_ros.core.pipeline import Carver, PoseEstimator
+from limbloc_ros.core.pose import JOINT_NAMES, STICK_BONES, Pose
+from limbloc_ros.recordings.cases import load_case
+
+BENCHMARK = Path(__file__).parent / "data" / "benchmark"
+WALK = "public/seq_walk_circle"
+FRAMES = range(20, 24)
+
+
+@cache
+def case(name=WALK):
+    return load_case(BENCHMARK / name)
+
+
+@cache
+def hull_of(frame, name=WALK):
+    return Carver(case(name).rig).carve(case(name).masks(frame))
+
+
+@cache
+def alone(frame):
+    """The pose of one frame, fitted by a fresh estimator."""
+    return PoseEstimator().estimate(hull_of(frame))
+
+
+def moved(hull, voxels):
+    """The same hull elsewhere in the room."""
+    return dataclasses.replace(hull, index_min=tuple(int(i + v) for i, v in zip(hull.index_min, voxels, strict=True)))
+
+
+def errors(pose, frame, shift=(0.0, 0.0, 0.0)):
+    """[25] distances from the true joints, m."""
+    truth = np.array([case().truth[name][frame] for name in JOINT_NAMES])
+    return np.linalg.norm(pose.joints - truth - shift, axis=1)
+
+
+def same(a, b):
+    """Whether two poses are the same bit for bit, but for the times."""
+    assert a.angles == b.angles
+    assert (a.energy, a.reliable, a.sizes) == (b.energy, b.reliable, b.sizes)
+    for name in ("joints", "rotations", "parameters", "sigma"):
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+
+
+def test_a_pose_is_complete_and_finite():
+    check_pose(alone(FRAMES[0]))
+    assert alone(FRAMES[0]).reliable
+    assert set(alone(FRAMES[0]).stage_ms) == {"surface", "fit"}
+
+
+def check_pose(pose):
+    assert isinstance(pose, Pose)
+    for values in (pose.joints, pose.rotations, pose.parameters, pose.sigma, pose.energy):
+        assert np.isfinite(values).all()
+    assert pose.joints.shape == (25, 3)
+    assert pose.sigma.shape == (25,)
+    assert (pose.sigma > 0).all()
+    assert pose.bone_names == BONE_NAMES
+    np.testing.assert_allclose(
+        pose.rotations @ pose.rotations.transpose(0, 2, 1), np.tile(np.eye(3), (19, 1, 1)), atol=1e-9
+    )
+    assert set(pose.angles) == {angle.name for angle in NATIVE_ANGLES}
+    assert np.isfinite(list(pose.angles.values())).all()
+    assert set(pose.sizes) == {*(f"{a}-{b}" for a, b in STICK_BONES), "stature"}
+    assert all(0 < size < 2.5 for size in pose.sizes.values())
+    assert 0 <= pose.energy < 1
+    assert all(ms >= 0 for ms in pose.stage_ms.values())
+    # the parameters are the pose
+    placed = place(FigureState.from_vector(pose.parameters))
+    np.testing.assert_array_equal(placed.joints, pose.joints)
+    np.testing.assert_array_equal(placed.spheres, pose.flesh.centres)
+    np.testing.assert_array_equal(placed.radii, pose.flesh.radii)
+
+
+def test_masks_to_joints():
+    for frame in FRAMES[:2]:
+        error = errors(alone(frame), frame)
+        assert np.median(error) < 0.03
+        assert error.mean() < 0.05
+
+
+def test_the_carver_carves_what_carve_carves():
+    hull, whole = hull_of(FRAMES[0]), carve(case().masks(FRAMES[0]), case().rig, HullConfig())
+    np.testing.assert_array_equal(hull.sdf, whole.sdf)
+    assert hull.index_min == whole.index_min
+    assert hull.cameras == tuple(camera.name for camera in case().rig.cameras)
+
+
+def test_masks_that_do_not_fit_and_empty_rooms():
+    carver = Carver(case().rig)
+    masks = case().masks(FRAMES[0])
+    first = next(iter(masks))
+    with pytest.raises(InputError, match=first):
+        carver.carve({**masks, first: masks[first][:-1]})
+    with pytest.raises(RigError, match="cam_on_the_moon"):
+        carver.carve({**masks, "cam_on_the_moon": masks[first]})
+    assert isinstance(carver.carve({name: np.zeros_like(mask) for name, mask in masks.items()}), NoPerson)
+    assert isinstance(carver.carve({}), NoPerson)
+    assert isinstance(carver.carve({first: masks[first]}), NoPerson)
+
+
+@pytest.mark.parametrize("engine", ["robust", "paper"])
+def test_hulls_without_a_person(engine):
+    estimator = PoseEstimator(FitConfig(engine=engine))
+    empty = Hull(0.02, (0, 0, 0), np.full((3, 3, 3), 0.06, np.float32), 0.06)
+    speck = dataclasses.replace(empty, sdf=empty.sdf.copy())
+    speck.sdf[1, 1, 1] = -0.01
+    for hull in (empty, speck):
+        answer = estimator.estimate(hull)
+        assert isinstance(answer, NoPerson)
+        assert len(answer.reason) > 10
+
+
+def test_configs_are_checked():
+    with pytest.raises(ConfigError, match="engine: expected one of robust, paper, got 'magic'"):
+        PoseEstimator(FitConfig(engine="magic"))
+    with pytest.raises(ConfigError, match="voxel_m"):
+        Carver(case().rig, HullConfig(voxel_m=1.0))
+
+
+# frames alone
+
+
+def test_a_frame_alone_does_not_depend_on_those_before():
+    estimator = PoseEstimator(FitConfig(temporal=False))
+    for frame in (FRAMES[1], FRAMES[0]):  # the wrong way round
+        same(estimator.estimate(hull_of(frame)), alone(frame))
+
+
+def test_moving_the_room_by_whole_voxels_moves_the_person():
+    shift = np.array([37, -52, 4])
+    pose, there = alone(FRAMES[0]), PoseEstimator().estimate(moved(hull_of(FRAMES[0]), shift))
+    gap = there.joints - pose.joints - 0.02 * shift
+    assert np.median(np.linalg.norm(gap, axis=1)) < 0.01  # rounding may lead the search another way, not elsewhere
+    assert errors(there, FRAMES[0], 0.02 * shift).mean() < 0.05
+
+
+# from frame to frame
+
+
+def test_temporal_fits_follow():
+    estimator = PoseEstimator(FitConfig(temporal=True))
+    first = estimator.estimate(hull_of(FRAMES[0]))
+    same(first, alone(FRAMES[0]))  # nothing to start from yet
+    for frame in FRAMES[1:]:
+        pose = estimator.estimate(hull_of(frame))
+        check_pose(pose)
+        assert np.median(errors(pose, frame)) < 0.03
+        assert errors(pose, frame).mean() < 0.05
+
+
+def test_temporal_fits_survive_a_jump():
+    estimator = PoseEstimator(FitConfig(temporal=True))
+    estimator.estimate(hull_of(FRAMES[0]))
+    voxels = np.array([60, 35, 0])  # 1.4 m away in a fortieth of a second
+    for frame in FRAMES[1:3]:
+        pose = estimator.estimate(moved(hull_of(frame), voxels))
+    error = errors(pose, frame, 0.02 * voxels)
+    assert np.median(error) < 0.03
+    assert error.mean() < 0.06
+
+
+def test_temporal_fits_survive_a_frame_without_a_person():
+    estimator = PoseEstimator(FitConfig(temporal=True))
+    estimator.estimate(hull_of(FRAMES[0]))
+    speck = Hull(0.02, (0, 0, 0), np.full((3, 3, 3), 0.06, np.float32), 0.06)
+    assert isinstance(estimator.estimate(speck), NoPerson)
+    pose = estimator.estimate(hull_of(FRAMES[1]))
+    assert np.median(errors(pose, FRAMES[1])) < 0.03
+
+
+def test_reset_forgets():
+    estimator = PoseEstimator(FitConfig(temporal=True))
+    estimator.estimate(hull_of(FRAMES[1]))
+    estimator.reset()
+    same(estimator.estimate(hull_of(FRAMES[0])), alone(FRAMES[0]))
+
+
+# the paper's own engine
+
+
+def test_the_papers_engine_gives_poses_too():
+    coarse = Carver(case().rig, HullConfig(voxel_m=0.04)).carve(case().masks(FRAMES[0]))
+    pose = PoseEstimator(FitConfig(engine="paper")).estimate(coarse)
+    check_pose(pose)
+    assert "fit" in pose.stage_ms
+    assert np.median(errors(pose, FRAMES[0])) < 0.15
+
+
+def test_warm_up_needs_no_room():
+    Carver.warm_up()
+    PoseEstimator.warm_up()
