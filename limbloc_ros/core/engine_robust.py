@@ -108,9 +108,10 @@ class Fit:
 
 
 def fit_from_scratch(
-    hull: Hull, surface: Surface, seed: int, weights: Weights = Weights(), effort: Effort = Effort()
+    hull: Hull, surface: Surface, seed: int, weights: Weights | None = None, effort: Effort | None = None
 ) -> Fit | None:
     """Fit one frame alone: torso hypotheses, both facings, limbs, refinement, arm repair."""
+    weights, effort = weights or Weights(), effort or Effort()
     rng = np.random.default_rng(seed)
     medial = Medial.of(hull)
     quick = gather_evidence(hull, surface, effort.quick_points, rng)
@@ -141,28 +142,36 @@ def fit_from_scratch(
 class Tracker:
     """Fits frame after frame, each from the last; starts anew when there is no last one or the fit went wrong."""
 
-    #: A cost this much above the usual one is no longer believed.
-    DOUBT = 1.35
+    #: A cost this much above the usual one, or above this many m^2, is no longer believed ...
+    DOUBT, DOUBTFUL_COST = 1.35, 4.5e-4
+    #: ... but while it stays high, starting anew is tried only every so many frames; limbs are checked as often.
+    PATIENCE = 5
 
-    def __init__(self, seed: int, weights: Weights = Weights(), effort: Effort = Effort()) -> None:
-        self._seed, self._weights, self._effort = seed, weights, effort
-        self._last: FigureState | None = None
-        self._usual_cost = 0.0
+    def __init__(self, seed: int, weights: Weights | None = None, effort: Effort | None = None) -> None:
+        self._seed, self._weights, self._effort = seed, weights or Weights(), effort or Effort()
+        self.reset()
 
     def reset(self) -> None:
         """Forget the last frame."""
-        self._last = None
+        self._last: FigureState | None = None
+        self._usual_cost = 0.0
+        self._frame = 0
+        self._last_scratch = -self.PATIENCE
 
     def follow(self, hull: Hull, surface: Surface) -> Fit | None:
         """Fit the next frame."""
+        self._frame += 1
         fit: Fit | None = None
         if self._last is not None:
             evidence = gather_evidence(hull, surface, 600, np.random.default_rng(self._seed))
             result = refine(self._last, evidence, self._weights, 10)
+            if self._frame % self.PATIENCE == 0:
+                result = self._check_arms(result, hull, evidence)
             fit = Fit(result.state, result.system, np.inf)
-        if fit is None or fit.system.cost > self.DOUBT * self._usual_cost:
+        if fit is None or self._doubts(fit.system.cost):
+            self._last_scratch = self._frame
             scratch = fit_from_scratch(hull, surface, self._seed, self._weights, self._effort)
-            if scratch is not None and (fit is None or scratch.system.cost < 0.9 * fit.system.cost):
+            if scratch is not None and (fit is None or scratch.system.cost < 0.95 * fit.system.cost):
                 fit = scratch
         if fit is None:
             self._last = None
@@ -172,3 +181,16 @@ class Tracker:
         self._usual_cost = fit.system.cost if fresh else 0.9 * self._usual_cost + 0.1 * fit.system.cost
         self._last = fit.state
         return fit
+
+    def _doubts(self, cost: float) -> bool:
+        waited = self._frame - self._last_scratch >= self.PATIENCE
+        return cost > 2 * self.DOUBT * self._usual_cost or (
+            waited and (cost > self.DOUBT * self._usual_cost or cost > self.DOUBTFUL_COST)
+        )
+
+    def _check_arms(self, result: lm.LmResult[FigureState], hull: Hull, evidence: Evidence) -> lm.LmResult[FigureState]:
+        """An arm that has slipped into the trunk stays there, for its flesh is explained: look for it elsewhere."""
+        samples = evidence.points[:: max(1, len(evidence.points) // 300)]
+        others = with_arms(result.state, hull, Medial.of(hull), samples, self._effort.repairs)
+        best = refine(by_cost(others, evidence, self._weights, 1)[0], evidence, self._weights, 10)
+        return best if best.system.cost < 0.97 * result.system.cost else result
