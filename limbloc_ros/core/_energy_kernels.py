@@ -147,7 +147,7 @@ def sample_sdf(sdf: Any, origin: Any, voxel: float, x: float, y: float, z: float
     w0 = (1.0 - a) * (v001 - v000) + a * (v101 - v100)
     w1 = (1.0 - a) * (v011 - v010) + a * (v111 - v110)
     out[2] = ((1.0 - b) * w0 + b * w1) / voxel
-    return v0 + a * (v1 - v0)
+    return v0 + a * (v1 - v0)  # type: ignore[no-any-return]
 
 
 @njit(cache=True)  # type: ignore[misc, unused-ignore]
@@ -365,7 +365,7 @@ def posture_term(
         cost += shape_weight * shape[k] * shape[k]
         A[first + k, first + k] += shape_weight
         g[first + k] += shape_weight * shape[k]
-    return cost
+    return cost  # type: ignore[no-any-return]
 
 
 @njit(cache=True)  # type: ignore[misc, unused-ignore]
@@ -377,8 +377,8 @@ def xor_counts(sdf: Any, origin: Any, voxel: float, parts: Any, spheres: Any, ra
     high = np.array([nx, ny, nz])
     for p in range(len(parts)):
         for a in range(3):
-            low[a] = min(low[a], int(math.floor((bounds[p, a] - bounds[p, 3] - origin[a]) / voxel)))
-            high[a] = max(high[a], int(math.ceil((bounds[p, a] + bounds[p, 3] - origin[a]) / voxel)) + 1)
+            low[a] = min(low[a], math.floor((bounds[p, a] - bounds[p, 3] - origin[a]) / voxel))
+            high[a] = max(high[a], math.ceil((bounds[p, a] + bounds[p, 3] - origin[a]) / voxel) + 1)
     filled = np.zeros((high[0] - low[0], high[1] - low[1], high[2] - low[2]), np.uint8)
     w = np.empty(3)
     for p in range(len(parts)):
@@ -391,8 +391,8 @@ def xor_counts(sdf: Any, origin: Any, voxel: float, parts: Any, spheres: Any, ra
                 s = parts[p, k]
                 s0 = min(s0, spheres[s, a] - radii[s])
                 s1 = max(s1, spheres[s, a] + radii[s])
-            lo[a] = int(math.ceil((s0 - origin[a]) / voxel)) - low[a]
-            hi[a] = int(math.floor((s1 - origin[a]) / voxel)) - low[a]
+            lo[a] = math.ceil((s0 - origin[a]) / voxel) - low[a]
+            hi[a] = math.floor((s1 - origin[a]) / voxel) - low[a]
         for i in range(lo[0], hi[0] + 1):
             x = origin[0] + (i + low[0]) * voxel
             for j in range(lo[1], hi[1] + 1):

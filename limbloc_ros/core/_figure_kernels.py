@@ -265,12 +265,12 @@ def part_distance(px: float, py: float, pz: float, part: Any, points: Any, radii
         x = px - a[0]
         y = py - a[1]
         z = pz - a[2]
-        return math.sqrt(x * x + y * y + z * z) - radii[ia]
+        return math.sqrt(x * x + y * y + z * z) - radii[ia]  # type: ignore[no-any-return]
     if ic == ib:
         d, t = _segment(px, py, pz, a, radii[ia], b, radii[ib])
         weights[0] = 1.0 - t
         weights[1] = t
-        return d
+        return d  # type: ignore[no-any-return]
     c = points[ic]
     ux = b[0] - a[0]
     uy = b[1] - a[1]
@@ -311,7 +311,7 @@ def part_distance(px: float, py: float, pz: float, part: Any, points: Any, radii
                 ex = qx - s * ux - t * vx
                 ey = qy - s * uy - t * vy
                 ez = qz - s * uz - t * vz
-                return math.sqrt(ex * ex + ey * ey + ez * ez) - (radii[ia] + s * rb + t * rc)
+                return math.sqrt(ex * ex + ey * ey + ez * ez) - (radii[ia] + s * rb + t * rc)  # type: ignore[no-any-return]
     best, t = _segment(px, py, pz, a, radii[ia], b, radii[ib])
     weights[0] = 1.0 - t
     weights[1] = t
@@ -327,7 +327,7 @@ def part_distance(px: float, py: float, pz: float, part: Any, points: Any, radii
         weights[0] = 1.0 - t
         weights[1] = 0.0
         weights[2] = t
-    return best
+    return best  # type: ignore[no-any-return]
 
 
 @njit(cache=True)  # type: ignore[misc, unused-ignore]

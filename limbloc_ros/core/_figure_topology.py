@@ -42,7 +42,7 @@ BONES: list[tuple[str, str, str]] = [
             ("foot_L", "shin_L", "xyz"),
         ]
     ),
-]  # type: ignore[assignment]
+]
 
 #: The bone that carries each published joint.
 JOINT_BONES: dict[str, str] = {

@@ -27,7 +27,7 @@ def depth_at(sdf: Any, origin: Any, voxel: float, x: float, y: float, z: float) 
     v11 = sdf[i + 1, j + 1, k] + c * (sdf[i + 1, j + 1, k + 1] - sdf[i + 1, j + 1, k])
     v0 = v00 + b * (v01 - v00)
     v1 = v10 + b * (v11 - v10)
-    return v0 + a * (v1 - v0)
+    return v0 + a * (v1 - v0)  # type: ignore[no-any-return]
 
 
 @njit(cache=True)  # type: ignore[misc, unused-ignore]

@@ -74,7 +74,7 @@ class Proportions:
     @property
     def n_shape(self) -> int:
         """Length of the shape vector."""
-        return self.bone_offsets.shape[2]
+        return int(self.bone_offsets.shape[2])
 
 
 @cache

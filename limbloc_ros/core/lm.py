@@ -72,10 +72,11 @@ def minimise(
     state, system = start, evaluate(start)
     stop = "iterations"
     count = 0
-    for count in range(1, iterations + 1):
+    while count < iterations:
+        count += 1
         diagonal = np.diag(system.matrix)
         damped = system.matrix + np.diag(damping * np.maximum(diagonal, 1e-6 * diagonal.max() + 1e-12))
-        step = -np.linalg.solve(damped, system.gradient)
+        step = np.asarray(-np.linalg.solve(damped, system.gradient), np.float64)
         if largest_step is not None:
             step /= max(1.0, float((np.abs(step) / largest_step).max()))
         trial_state = retract(state, step)

@@ -45,7 +45,7 @@ _TORSO_BONES = [name for name in figure.BONE_NAMES if not name.startswith(("fore
 class TorsoTable:
     """The mean figure's torso in the arrays that the kernels take; lengths in units of the stature."""
 
-    arrays: tuple[Array, Array, Array, Array, Array]
+    arrays: tuple[NDArray[np.int64], Array, NDArray[np.int64], Array, Array]
     weights: Array
     n_solid: int
     bends: Array
@@ -111,7 +111,9 @@ class Medial:
         return Medial(kernels.medial_ridge(sdf, hull.origin_m, hull.voxel_m, 0.15 * hull.voxel_m, 0.65))
 
 
-def torso_hypotheses(hull: Hull, medial: Medial, rng: np.random.Generator, keep: int = 6) -> list[tuple[FigureState, float]]:
+def torso_hypotheses(
+    hull: Hull, medial: Medial, rng: np.random.Generator, keep: int = 6
+) -> list[tuple[FigureState, float]]:
     """Torsos that fit the hull, the best first, without limbs; each stands for both of its facings.
 
     Brute force over pairs of medial points (pelvis, skull) x bends x headings, then hill climbing of the best.
@@ -215,14 +217,10 @@ class LimbKind:
 ARM = LimbKind(("upper_arm", "forearm", "hand"), ("deltoid", "elbow", "wrist"), "tips", 0.3, 1.5)
 LEG = LimbKind(("thigh", "shin", "foot"), ("thigh_top", "knee", "ankle"), "heel", 0.3, 1.5)
 
-TRUNK_PARTS = np.array(
-    [p for p, name in enumerate(figure.PART_NAMES) if name in ("pelvis", "belly", "abdomen", "thorax", "chest", "head", "neck")]
-)
-
 #: Parts that a leg does not run through.
-UPPER_TRUNK_PARTS = np.array(
-    [p for p, name in enumerate(figure.PART_NAMES) if name in ("belly", "abdomen", "thorax", "chest", "head", "neck")]
-)
+_UPPER_TRUNK = ("belly", "abdomen", "thorax", "chest", "head", "neck")
+UPPER_TRUNK_PARTS = np.array([p for p, name in enumerate(figure.PART_NAMES) if name in _UPPER_TRUNK])
+TRUNK_PARTS = np.array([p for p, name in enumerate(figure.PART_NAMES) if name in ("pelvis", *_UPPER_TRUNK)])
 
 
 @dataclass(frozen=True)
@@ -275,9 +273,7 @@ def limb_candidates(
     # thighs do not point up the back or far across the other side
     no_go = -outward if kind is ARM else (-pelvis[:, 0] + 0.6 * pelvis[:, 2] - 0.4 * outward)
     forbidden = np.append(no_go / np.linalg.norm(no_go), 0.97 if kind is ARM else 0.6)
-    near = medial.points[
-        ((medial.points[:, :3] - base) ** 2).sum(axis=1) < (1.2 * lengths.sum()) ** 2
-    ]
+    near = medial.points[((medial.points[:, :3] - base) ** 2).sum(axis=1) < (1.2 * lengths.sum()) ** 2]
     if len(near) > 500:
         near = near[:: len(near) // 500 + 1]
     found = limb_kernels.search_limb(
@@ -287,7 +283,9 @@ def limb_candidates(
     return Limbs(base, lengths, radii, tip_m, found)
 
 
-def limb_pairs(left: Limbs, right: Limbs, samples: Array, explained: NDArray[np.bool_], trade: float, keep: int) -> list[tuple[int, int, float]]:
+def limb_pairs(
+    left: Limbs, right: Limbs, samples: Array, explained: NDArray[np.bool_], trade: float, keep: int
+) -> list[tuple[int, int, float]]:
     """Pairs of a left and a right limb that together explain most of the hull.
 
     Args:
@@ -303,8 +301,8 @@ def limb_pairs(left: Limbs, right: Limbs, samples: Array, explained: NDArray[np.
     if len(left.found) == 0 or len(right.found) == 0:
         return []
     bits = [
-        np.array([limb_kernels.covered_by_limb(row, limb.base, limb.radii, limb.tip_m, samples, 0.035) for row in limb.found])
-        for limb in (left, right)
+        np.array([limb_kernels.covered_by_limb(row, x.base, x.radii, x.tip_m, samples, 0.035) for row in x.found])
+        for x in (left, right)
     ]
     taken = np.zeros(bits[0].shape[1] * 64, np.uint8)
     taken[: len(samples)] = explained
