@@ -34,7 +34,7 @@ def joint_sigma(state: FigureState, system: System) -> Array:
     covariance = np.linalg.inv(system.matrix + 1e-9 * np.trace(system.matrix) / n * np.eye(n))
     J = figure.place_jacobian(state)[figure.N_SPHERES :, :3]
     spread = np.einsum("jap,pq,jaq->j", J, covariance, J)
-    return np.sqrt(0.012**2 + 0.05 * system.cost * np.maximum(spread, 0.0))
+    return np.asarray(np.sqrt(0.012**2 + 0.05 * system.cost * np.maximum(spread, 0.0)))
 
 
 def describe_pose(state: FigureState, hull: Hull, system: System | None, stage_ms: Mapping[str, float]) -> Pose:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from limbloc_ros.core import energy, figure, lm, search
+from limbloc_ros.core._figure_kernels import flesh_distance
 from limbloc_ros.core.energy import Evidence, Weights
 from limbloc_ros.core.figure import FigureState
 from limbloc_ros.core.hull import Hull
@@ -82,7 +83,7 @@ def _with_pairs(
     pairs: int,
 ) -> list[FigureState]:
     placed = figure.place(state)
-    distance, _ = figure.kernels.flesh_distance(samples, figure.PART_SPHERES[explaining], placed.spheres, placed.radii)
+    distance, _ = flesh_distance(samples, figure.PART_SPHERES[explaining], placed.spheres, placed.radii)
     taken = search.explained_volume(hull, placed, solid)
     left, right = (search.limb_candidates(hull, medial, placed, kind, side, taken, 40) for side in "LR")
     out = []
