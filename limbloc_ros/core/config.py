@@ -113,6 +113,9 @@ class HullConfig:
         0.06, "signed distances outside the hull are kept up to this, as a thin shell", unit="m", low=0.01, high=0.5
     )
     min_cameras: int = setting(2, "fewer live masks than this give no hull", low=1, high=64, live=True)
+    min_share: float = setting(
+        0.6, "fewer live masks than this share of the rig's cameras give no hull", low=0.0, high=1.0, live=True
+    )
     repair_depth_m: float = setting(
         0.04,
         "with six cameras or more, a voxel that one camera denies stays when this deep inside all other silhouettes",

@@ -221,9 +221,13 @@ def mend_silhouettes(
 
 def carve_silhouettes(silhouettes: Silhouettes, rig: Rig, config: HullConfig) -> Hull | NoPerson:
     """Carve the hull from measured silhouettes; see `carve`."""
-    if len(silhouettes.names) < config.min_cameras:
+    # A few cameras of many leave far too much standing: better no hull than a confident wrong one.
+    needed = max(config.min_cameras, math.ceil(config.min_share * len(rig.cameras) - 1e-9))
+    if len(silhouettes.names) < needed:
         reasons = "; ".join(f"{name}: {why}" for name, why in silhouettes.rejected.items())
-        return NoPerson(f"{len(silhouettes.names)} usable masks, expected at least {config.min_cameras} ({reasons})")
+        return NoPerson(
+            f"{len(silhouettes.names)} usable masks of {len(rig.cameras)} cameras, expected at least {needed} ({reasons})"
+        )
     silhouettes = reject_dead_cameras(silhouettes, rig, config)
     voxels = evaluate(silhouettes, rig, config.voxel_m, config.band_m)
     covered = cover_silhouettes(silhouettes, voxels, config)
