@@ -141,6 +141,7 @@ def test_benchmark_people_are_found_within_the_papers_five_centimetres(case, fra
     branch, seen = found
     assert median_error(branch, data.truth, frame) < 0.05
     assert branch.terms.overlap < 0.4
+    assert branch.search is not None and branch.search.stop in ("converged", "stagnated", "max_evaluations")
     assert set(branch.limbs) == {"leg_L", "leg_R", "arm_L", "arm_R"}
     assert len(seen.geodesic) == len(seen.surface) and np.isfinite(seen.variability).all()
 

@@ -20,8 +20,9 @@ from limbloc_ros.core.errors import NoPerson
 from limbloc_ros.core.figure import PART_NAMES, FigureState, place
 from limbloc_ros.core.geodesic import Maxima, centre_of_mass, geodesic_map, wide_maxima
 from limbloc_ros.core.hull import Hull
-from limbloc_ros.core.paper_energy import Block, PaperEnergy, PaperTerms, block_of, stage_of
+from limbloc_ros.core.paper_energy import PaperEnergy, PaperTerms, block_of, stage_of
 from limbloc_ros.core.pose import Flesh
+from limbloc_ros.core.simplex import SimplexResult
 from limbloc_ros.core.surface import Surface, curvature_variability, extract_surface
 
 Array = NDArray[np.float64]
@@ -40,17 +41,25 @@ TORSO_POSE = block_of("torso", _TORSO_ROWS[:-1])
 SIZES = block_of("sizes", [{"shape_0": 0.04}, *({f"shape_{k}": 0.7} for k in (1, 2, 3, 4))])
 
 
-def _limb_block(kind: str, side: str) -> Block:
+def _limb_rows(kind: str, side: str) -> list[dict[str, float]]:
     if kind == "leg":
         rows = [{f"thigh_{side}_{axis}": 0.15} for axis in "xyz"]
-        rows += [{f"shin_{side}_y": 0.2}, {f"foot_{side}_x": 0.15}, {f"foot_{side}_y": 0.15}]
-    else:
-        rows = [{f"clavicle_{side}_x": 0.12}, {f"clavicle_{side}_z": 0.12}]
-        rows += [{f"upper_arm_{side}_{axis}": 0.2} for axis in "xyz"]
-        rows += [{f"forearm_{side}_y": 0.25}, {f"hand_{side}_x": 0.2}, {f"hand_{side}_y": 0.2}]
-    return block_of(f"{kind}_{side}", rows)
+        return [*rows, {f"shin_{side}_y": 0.2}, {f"foot_{side}_x": 0.15}, {f"foot_{side}_y": 0.15}]
+    rows = [{f"clavicle_{side}_x": 0.12}, {f"clavicle_{side}_z": 0.12}]
+    rows += [{f"upper_arm_{side}_{axis}": 0.2} for axis in "xyz"]
+    return [*rows, {f"forearm_{side}_y": 0.25}, {f"hand_{side}_x": 0.2}, {f"hand_{side}_y": 0.2}]
 
 
+_LIMBS = [(kind, side) for kind in ("leg", "arm") for side in "LR"]
+LIMBS = {(kind, side): block_of(f"{kind}_{side}", _limb_rows(kind, side)) for kind, side in _LIMBS}
+#: Everything at once, in small steps: 40 parameters, near the paper's 43.
+WHOLE = block_of(
+    "whole",
+    [
+        {name: 0.3 * amount for name, amount in row.items()}
+        for row in (*_TORSO_ROWS, *(row for kind, side in _LIMBS for row in _limb_rows(kind, side)))
+    ],
+)
 #: A reading whose energy is higher than this is probably wrong: more heads are tried.
 DOUBTFUL = 0.36
 #: So many pairs of limbs are posed and compared by their energy.
@@ -61,7 +70,6 @@ TRUST = 0.2
 CONTACT_M = 0.05
 #: Legs that gain less than this per voxel make other sizes be tried.
 POOR = 0.25
-LIMBS = {(kind, side): _limb_block(kind, side) for kind in ("leg", "arm") for side in "LR"}
 WITH_TORSO, WITH_LEGS, WITH_ALL = stage_of(), stage_of("leg"), stage_of("leg", "arm")
 
 
@@ -87,13 +95,23 @@ class Description:
 
 @dataclass(frozen=True)
 class Branch:
-    """One way to read the hull, as far as the fitting sequence has come."""
+    """One way to read the hull, as far as the fitting sequence has come.
+
+    Attributes:
+        head: where it began.
+        state: the figure so far.
+        energy: the energy that judges it.
+        terms: its value, term by term.
+        limbs: the anchor points of each limb by `leg_L`, `leg_R`, `arm_L`, `arm_R` (figs. 6 and 7).
+        search: how the global refinement ended; None before it.
+    """
 
     head: Head
     state: FigureState
     energy: PaperEnergy
     terms: PaperTerms
     limbs: dict[str, Limb]
+    search: SimplexResult | None = None
 
 
 def describe(hull: Hull) -> Description:
@@ -123,7 +141,7 @@ def fit_state(hull: Hull) -> tuple[Branch, Description] | NoPerson:
     best = _from_heads(grid, likely, seen)
     if best.terms.total > DOUBTFUL and len(likely) < len(heads):
         best = _best([best, _from_heads(grid, heads[len(likely) :], seen)], 1)[0]
-    return _refine(best, 2), seen
+    return _refine_whole(_refine(best)), seen
 
 
 def _from_heads(grid: Grid, heads: list[Head], seen: Description) -> Branch:
@@ -133,7 +151,7 @@ def _from_heads(grid: Grid, heads: list[Head], seen: Description) -> Branch:
     branches = [_add_limbs(grid, branch, "leg", cues) for branch in _best(branches, 6)]
     branches = [_fit_size(grid, branch, cues) for branch in _best(branches, 3)]
     branches = [_add_limbs(grid, branch, "arm", cues) for branch in branches]
-    branches = [_refine(branch, 1) for branch in _best(branches, 2)]
+    branches = [_refine(branch) for branch in _best(branches, 2)]
     return _best(branches, 1)[0]
 
 
@@ -197,13 +215,18 @@ def _judged(branch: Branch, kind: str) -> float:
     return branch.terms.total - TRUST * (sum(gains) if gains else -2.0)
 
 
-def _refine(branch: Branch, rounds: int) -> Branch:
+def _refine(branch: Branch) -> Branch:
     """Block by block from the trunk to the leaves (section 2.3), then sizes."""
     state = branch.state
-    for _ in range(rounds):
-        for block, budget in ((TORSO, 150), *((block, 120) for block in LIMBS.values()), (SIZES, 60)):
-            state, _result = branch.energy.refine(state, block, budget, WITH_ALL)
+    for block, budget in ((TORSO, 150), *((block, 120) for block in LIMBS.values()), (SIZES, 60)):
+        state, _result = branch.energy.refine(state, block, budget, WITH_ALL)
     return replace(branch, state=state, terms=branch.energy.terms(state, WITH_ALL))
+
+
+def _refine_whole(branch: Branch) -> Branch:
+    """The global refinement (section 2.5)."""
+    state, result = branch.energy.refine(branch.state, WHOLE, 600, WITH_ALL)
+    return replace(branch, state=state, terms=branch.energy.terms(state, WITH_ALL), search=result)
 
 
 def _best(branches: list[Branch], count: int) -> list[Branch]:
