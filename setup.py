@@ -46,6 +46,7 @@ setup(
     ],
     extras_require={
         "dev": [
+            "psutil>=5.9,<8",
             "pytest>=8,<10",
             "hypothesis>=6.100,<7",
             "ruff==0.17.6",

@@ -212,9 +212,7 @@ def test_slow_motions_jump_only_at_a_pole_or_back_into_the_human_range():
             abduction = angles[frame : frame + 2, names.index(f"{joint}_abduction")]
             near_pole = np.abs(np.cos(abduction)).min() < np.sin(np.radians(8))
             rows = [k for k, name in enumerate(names) if name.startswith(joint)]
-            strayed = any(
-                not NATIVE_ANGLES[k].low - 0.5 < angles[frame, k] < NATIVE_ANGLES[k].high + 0.5 for k in rows
-            )
+            strayed = any(not NATIVE_ANGLES[k].low - 0.5 < angles[frame, k] < NATIVE_ANGLES[k].high + 0.5 for k in rows)
             assert near_pole or strayed, (names[column], np.degrees(angles[frame : frame + 2, rows]))
             jumps += 1
     assert jumps > 0  # otherwise the motions are too tame to test anything

@@ -70,12 +70,21 @@ def camera_distance(cam: Any, box: Any, field: Any, far: float, x: float, y: flo
     top = field[at] + fx * (field[at + 1] - field[at])
     at += box[2]
     bottom = field[at] + fx * (field[at + 1] - field[at])
-    return (top + fy * (bottom - top)) * depth / cam[12]
+    distance: float = (top + fy * (bottom - top)) * depth / cam[12]
+    return distance
 
 
 @njit(cache=True)  # type: ignore[misc, unused-ignore]
 def block_is_outside(
-    corner: Any, size: int, cams: Any, boxes: Any, field: Any, voxel: float, band: float, keep_second: bool, min_seen: int
+    corner: Any,
+    size: int,
+    cams: Any,
+    boxes: Any,
+    field: Any,
+    voxel: float,
+    band: float,
+    keep_second: bool,
+    min_seen: int,
 ) -> bool:
     """Whether no voxel of a block (cube of `size` voxels, lowest lattice index `corner`) can be wanted.
 
@@ -133,7 +142,15 @@ def block_is_outside(
 
 @njit(cache=True)  # type: ignore[misc, unused-ignore]
 def split_blocks(
-    blocks: Any, size: int, cams: Any, boxes: Any, field: Any, voxel: float, band: float, keep_second: bool, min_seen: int
+    blocks: Any,
+    size: int,
+    cams: Any,
+    boxes: Any,
+    field: Any,
+    voxel: float,
+    band: float,
+    keep_second: bool,
+    min_seen: int,
 ) -> Any:
     """Drop the blocks that hold no wanted voxel and split the others in eight."""
     out = np.empty((len(blocks) * 8, 3), np.int32)
@@ -282,10 +299,10 @@ def cover(points: Any, reach: float, cams: Any, boxes: Any, covered: Any) -> Non
                 continue
             box = boxes[c]
             r = reach * cams[c][12] / depth
-            x0 = max(0, int(math.ceil(u - r)) - box[0])
-            x1 = min(box[2] - 1, int(math.floor(u + r)) - box[0])
-            y0 = max(0, int(math.ceil(v - r)) - box[1])
-            y1 = min(box[3] - 1, int(math.floor(v + r)) - box[1])
+            x0 = max(0, math.ceil(u - r) - box[0])
+            x1 = min(box[2] - 1, math.floor(u + r) - box[0])
+            y0 = max(0, math.ceil(v - r) - box[1])
+            y1 = min(box[3] - 1, math.floor(v + r) - box[1])
             for y in range(y0, y1 + 1):
                 at = box[4] + y * box[2]
                 for x in range(x0, x1 + 1):
@@ -293,7 +310,9 @@ def cover(points: Any, reach: float, cams: Any, boxes: Any, covered: Any) -> Non
 
 
 @njit(cache=True)  # type: ignore[misc, unused-ignore]
-def count_unexplained(points: Any, deniers: Any, cams: Any, boxes: Any, field: Any, covered: Any, inner_px: float) -> Any:
+def count_unexplained(
+    points: Any, deniers: Any, cams: Any, boxes: Any, field: Any, covered: Any, inner_px: float
+) -> Any:
     """In how many cameras but the denier each point falls on foreground that nothing covers; int16 [V]."""
     out = np.zeros(len(points), np.int16)
     for n in range(len(points)):
@@ -324,9 +343,9 @@ def paint_balls(points: Any, radii: Any, cam: Any, box: Any, mask: Any) -> None:
         r = radii[n] * cam[12] / depth
         u -= box[0]
         v -= box[1]
-        y0 = max(0, int(math.ceil(v - r)))
-        y1 = min(box[3] - 1, int(math.floor(v + r)))
+        y0 = max(0, math.ceil(v - r))
+        y1 = min(box[3] - 1, math.floor(v + r))
         for y in range(y0, y1 + 1):
             w = math.sqrt(max(0.0, r * r - (y - v) * (y - v)))
-            for x in range(max(0, int(math.ceil(u - w))), min(box[2] - 1, int(math.floor(u + w))) + 1):
+            for x in range(max(0, math.ceil(u - w)), min(box[2] - 1, math.floor(u + w)) + 1):
                 mask[y, x] = 1

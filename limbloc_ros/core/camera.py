@@ -50,8 +50,9 @@ class Camera:
             raise RigError(f"camera {self.name}: image size must be positive, got {self.width}x{self.height}")
         if self.K[0, 0] <= 0 or self.K[1, 1] <= 0:
             raise RigError(
-                f"camera {self.name}: K has focal lengths {self.K[0, 0]:g}, {self.K[1, 1]:g} px; expected positive ones "
-                "(an all-zero K means the camera driver has no calibration: run camera_calibration or set camera_info_url)"
+                f"camera {self.name}: K has focal lengths {self.K[0, 0]:g}, {self.K[1, 1]:g} px; expected positive "
+                "ones (all zero means that the driver has no calibration: run camera_calibration or set "
+                "camera_info_url)"
             )
         if self.distortion_model not in DISTORTION_COEFFICIENTS:
             raise RigError(
@@ -131,7 +132,8 @@ class Rig:
         size = self.volume_max - self.volume_min
         if (size <= 0.1).any() or (size > 100).any():
             raise RigError(
-                f"the carve volume must be 0.1 to 100 m long on each axis, got {size.tolist()} m (are the units metres?)"
+                f"the carve volume must be 0.1 to 100 m long on each axis, got {size.tolist()} m "
+                "(are the units metres?)"
             )
 
     @property

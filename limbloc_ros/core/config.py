@@ -119,12 +119,17 @@ class HullConfig:
     repair_depth_m: float = setting(
         0.04,
         "with six cameras or more, a voxel that one camera denies stays when this deep inside all other silhouettes",
-        unit="m", low=0.0, high=1.0, live=True,
+        unit="m",
+        low=0.0,
+        high=1.0,
+        live=True,
     )
     shared_veto: float = setting(
         1.0,
-        "how far, with six cameras or more that contradict each other, the hull goes from what all see to what all but one see",
-        low=0.0, high=1.0, live=True,
+        "how far the hull of six or more cameras that contradict each other goes to what all but one see",
+        low=0.0,
+        high=1.0,
+        live=True,
     )
     min_voxels: int = setting(500, "smaller hulls are no person", unit="voxels", low=1, high=10_000_000, live=True)
 
@@ -135,9 +140,11 @@ class SyncConfig:
 
     slop_s: float = setting(0.02, "largest stamp difference within a set", unit="s", low=0.0, high=1.0, live=True)
     queue: int = setting(10, "sets that may wait for late cameras", unit="sets", low=1, high=1000)
-    timeout_s: float = setting(0.15, "an incomplete set is used or dropped after this", unit="s", low=0.0, high=10.0, live=True)
+    timeout_s: float = setting(
+        0.15, "an incomplete set is used or dropped after this", unit="s", low=0.0, high=10.0, live=True
+    )
     silent_sets: int = setting(
-        5, "a camera missing in this many sets running is not waited for until it is back (0: always wait)", low=0, high=1000
+        5, "a camera missing in this many sets running is no longer waited for (0: always wait)", low=0, high=1000
     )
 
 
@@ -190,11 +197,12 @@ def from_mapping(kind: type[T], values: Mapping[str, Any]) -> T:
         field = fields[name]
         default = field.default
         if default is dataclasses.MISSING:
-            default = field.default_factory()  # type: ignore[misc]
+            assert field.default_factory is not dataclasses.MISSING
+            default = field.default_factory()
         if dataclasses.is_dataclass(default):
             if not isinstance(value, Mapping):
                 raise ConfigError(f"{name}: expected a section of parameters, got {value!r}")
-            kwargs[name] = from_mapping(type(default), value)  # type: ignore[arg-type]
+            kwargs[name] = from_mapping(type(default), value)
             continue
         if isinstance(default, float) and isinstance(value, int) and not isinstance(value, bool):
             value = float(value)

@@ -106,9 +106,7 @@ def lattice_bounds(rig: Rig, voxel_m: float) -> tuple[NDArray[np.int64], NDArray
     return low, high
 
 
-def evaluate(
-    silhouettes: Silhouettes, rig: Rig, voxel_m: float, band_m: float, keep_second: bool = True
-) -> Voxels:
+def evaluate(silhouettes: Silhouettes, rig: Rig, voxel_m: float, band_m: float, keep_second: bool = True) -> Voxels:
     """Signed distances of every voxel near the hull, by halving blocks that may hold some of it.
 
     Exact: the same voxels and values as the evaluation of every voxel of the volume. A voxel must be seen by more
@@ -149,7 +147,7 @@ def reject_dead_cameras(silhouettes: Silhouettes, rig: Rig, config: HullConfig) 
         if denied[worst] < 2 * others.max():
             break
         silhouettes = silhouettes.without(
-            silhouettes.names[worst], f"its mask denies {denied[worst] / max(kept, 1):.1f} times the hull the others agree on"
+            silhouettes.names[worst], f"its mask denies {denied[worst] / max(kept, 1):.1f} times the hull that stays"
         )
     return silhouettes
 
@@ -226,7 +224,8 @@ def carve_silhouettes(silhouettes: Silhouettes, rig: Rig, config: HullConfig) ->
     if len(silhouettes.names) < needed:
         reasons = "; ".join(f"{name}: {why}" for name, why in silhouettes.rejected.items())
         return NoPerson(
-            f"{len(silhouettes.names)} usable masks of {len(rig.cameras)} cameras, expected at least {needed} ({reasons})"
+            f"{len(silhouettes.names)} usable masks of {len(rig.cameras)} cameras, "
+            f"expected at least {needed} ({reasons})"
         )
     silhouettes = reject_dead_cameras(silhouettes, rig, config)
     voxels = evaluate(silhouettes, rig, config.voxel_m, config.band_m)
@@ -250,7 +249,7 @@ def carve_silhouettes(silhouettes: Silhouettes, rig: Rig, config: HullConfig) ->
     )
     hull = largest_component(hull)
     if hull.inside_count * (config.voxel_m / 0.02) ** 3 < config.min_voxels:
-        return NoPerson(f"the hull has only {hull.inside_count} voxels of {config.voxel_m} m: nothing of a person's size")
+        return NoPerson(f"the hull has only {hull.inside_count} voxels of {config.voxel_m} m: too small for a person")
     return hull
 
 

@@ -145,9 +145,7 @@ class _Robot:
                 if link_of_sphere[a] == name:
                     self._cylinder(link, sides[name], figure, (a, b), self._origins[name])
 
-    def _cylinder(
-        self, link: ET.Element, side: str, figure: Placed, ends: tuple[str, str], origin: Array
-    ) -> None:
+    def _cylinder(self, link: ET.Element, side: str, figure: Placed, ends: tuple[str, str], origin: Array) -> None:
         rows = [SPHERE[sphere] for sphere in ends]
         start, end = figure.spheres[rows]
         x, y, z = end - start
