@@ -19,7 +19,7 @@ from limbloc_ros.recordings.cases import load_case
 
 BENCHMARK = Path(__file__).parent / "data" / "benchmark"
 WALK = "public/seq_walk_circle"
-FRAMES = range(20, 24)
+FRAMES = range(20, 23)
 
 
 @cache
@@ -88,10 +88,9 @@ def check_pose(pose):
 
 
 def test_masks_to_joints():
-    for frame in FRAMES[:2]:
-        error = errors(alone(frame), frame)
-        assert np.median(error) < 0.03
-        assert error.mean() < 0.05
+    error = errors(alone(FRAMES[0]), FRAMES[0])
+    assert np.median(error) < 0.03
+    assert error.mean() < 0.05
 
 
 def test_the_carver_carves_what_carve_carves():
@@ -138,8 +137,8 @@ def test_configs_are_checked():
 
 def test_a_frame_alone_does_not_depend_on_those_before():
     estimator = PoseEstimator(FitConfig(temporal=False))
-    for frame in (FRAMES[1], FRAMES[0]):  # the wrong way round
-        same(estimator.estimate(hull_of(frame)), alone(frame))
+    estimator.estimate(hull_of(FRAMES[1]))
+    same(estimator.estimate(hull_of(FRAMES[0])), alone(FRAMES[0]))
 
 
 def test_moving_the_room_by_whole_voxels_moves_the_person():
@@ -203,5 +202,4 @@ def test_the_papers_engine_gives_poses_too():
 
 
 def test_warm_up_needs_no_room():
-    Carver.warm_up()
-    PoseEstimator.warm_up()
+    Carver.warm_up()  # that of the fitting half runs with every pose node, see test_pose_node.py
