@@ -285,6 +285,27 @@ def penetration_term(
 
 
 @njit(cache=True)  # type: ignore[misc, unused-ignore]
+def turn_derivative(w: Any, out: Any) -> None:
+    """How the rotation vector w of a rotation changes with a small turn after it: inverse right Jacobian of SO(3)."""
+    t2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
+    if t2 < 1e-6:
+        c = 1.0 / 12.0
+    else:
+        t = math.sqrt(t2)
+        c = 1.0 / t2 - 0.5 / (t * math.tan(0.5 * t))
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = c * w[i] * w[j]
+        out[i, i] += 1.0 - c * t2
+    out[0, 1] -= 0.5 * w[2]
+    out[1, 0] += 0.5 * w[2]
+    out[0, 2] += 0.5 * w[1]
+    out[2, 0] -= 0.5 * w[1]
+    out[1, 2] -= 0.5 * w[0]
+    out[2, 1] += 0.5 * w[0]
+
+
+@njit(cache=True)  # type: ignore[misc, unused-ignore]
 def posture_term(
     rotations: Any,
     shape: Any,
@@ -311,7 +332,9 @@ def posture_term(
     """
     cost = 0.0
     nb = len(rotations)
+    nd = len(dof_bones)
     vectors = np.empty((nb, 3))
+    turns = np.empty((nb, 3, 3))
     R = np.empty((3, 3))
     for b in range(1, nb):
         for i in range(3):
@@ -322,40 +345,49 @@ def posture_term(
                     + rest[b, 2, i] * rotations[b, 2, j]
                 )
         vectors[b] = log_so3(R)
-    for d in range(len(dof_bones)):
+        turn_derivative(vectors[b], turns[b])
+    # each angle, and how it changes with the degrees of freedom of its bone (which stand together)
+    angles = np.zeros(nd)
+    slopes = np.zeros((nd, nd))
+    for d in range(nd):
         b = dof_bones[d]
         if b == 0:
             continue
-        angle = vectors[b, 0] * dof_axes[d, 0] + vectors[b, 1] * dof_axes[d, 1] + vectors[b, 2] * dof_axes[d, 2]
-        e = angle / spread[d]
-        cost += prior_weight * e * e
-        A[3 + d, 3 + d] += prior_weight / (spread[d] * spread[d])
-        g[3 + d] += prior_weight * e / spread[d]
+        for i in range(3):
+            angles[d] += vectors[b, i] * dof_axes[d, i]
+        for f in range(max(0, d - 2), min(nd, d + 3)):
+            if dof_bones[f] == b:
+                for i in range(3):
+                    for j in range(3):
+                        slopes[d, f] += dof_axes[d, i] * turns[b, i, j] * dof_axes[f, j]
+    for d in range(nd):
+        b = dof_bones[d]
+        if b == 0:
+            continue
         over = 0.0
-        if angle > high[d]:
-            over = angle - high[d]
-        elif angle < low[d]:
-            over = angle - low[d]
-        if over != 0.0:
-            cost += limit_weight * over * over
-            A[3 + d, 3 + d] += limit_weight
-            g[3 + d] += limit_weight * over
+        if angles[d] > high[d]:
+            over = angles[d] - high[d]
+        elif angles[d] < low[d]:
+            over = angles[d] - low[d]
+        prior = prior_weight / (spread[d] * spread[d])
+        cost += prior * angles[d] * angles[d] + limit_weight * over * over
+        pull = prior * angles[d] + limit_weight * over
+        stiffness = prior + (limit_weight if over != 0.0 else 0.0)
+        for f in range(max(0, d - 2), min(nd, d + 3)):
+            g[3 + f] += pull * slopes[d, f]
+            for h in range(max(0, d - 2), min(nd, d + 3)):
+                A[3 + f, 3 + h] += stiffness * slopes[d, f] * slopes[d, h]
     for m in range(len(smooth_pairs)):
         d1 = smooth_pairs[m, 0]
         d2 = smooth_pairs[m, 1]
-        a1 = 0.0
-        a2 = 0.0
-        for i in range(3):
-            a1 += vectors[dof_bones[d1], i] * dof_axes[d1, i]
-            a2 += vectors[dof_bones[d2], i] * dof_axes[d2, i]
-        e = a1 - a2
+        e = angles[d1] - angles[d2]
         cost += smooth_weight * e * e
-        A[3 + d1, 3 + d1] += smooth_weight
-        A[3 + d2, 3 + d2] += smooth_weight
-        A[3 + d1, 3 + d2] -= smooth_weight
-        A[3 + d2, 3 + d1] -= smooth_weight
-        g[3 + d1] += smooth_weight * e
-        g[3 + d2] -= smooth_weight * e
+        row = slopes[d1] - slopes[d2]
+        for f in range(nd):
+            if row[f] != 0.0:
+                g[3 + f] += smooth_weight * e * row[f]
+                for h in range(nd):
+                    A[3 + f, 3 + h] += smooth_weight * row[f] * row[h]
     first = 3 + len(dof_bones)
     e = (shape[0] - log_stature) / log_stature_std
     cost += shape_weight * e * e
