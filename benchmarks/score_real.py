@@ -70,18 +70,20 @@ def main() -> None:
     for path in args.references:
         truth = load_reference(path)[frames]
         mm = 1e3 * np.linalg.norm(joints - truth, axis=-1)
-        missing = np.isnan(mm)
+        known = np.isfinite(truth).all(axis=-1)  # the reference misses some joints itself
+        missing = np.isnan(mm) & known
         mm[missing] = MISSING_MM
         swaps = ", ".join(f"{limb} {int(hit.sum())}" for limb, hit in swapped(joints, truth).items())
-        print(f"{path.stem}: {len(mm)} frames, mean {mm.mean():.0f} mm, median {np.median(mm):.0f} mm, "
-              f"95th percentile {np.percentile(mm, 95):.0f} mm, missing {100 * missing.mean():.0f} %, "
+        print(f"{path.stem}: {len(mm)} frames, mean {np.nanmean(mm):.0f} mm, median {np.nanmedian(mm):.0f} mm, "
+              f"95th percentile {np.nanpercentile(mm, 95):.0f} mm, missing {100 * missing.sum() / known.sum():.1f} %, "
               f"frames with swapped {swaps}")  # fmt: skip
-        print("   " + "  ".join(f"{limb} {value:.0f}" for limb, value in zip(LIMBS, mm.mean(axis=0), strict=True)))
+        by_limb, by_frame = np.nanmean(mm, axis=0), np.nanmean(mm, axis=1)
+        print("   " + "  ".join(f"{limb} {value:.0f}" for limb, value in zip(LIMBS, by_limb, strict=True)))
         if args.per_frame:
-            print("   " + "  ".join(f"{f}: {value:.0f}" for f, value in zip(frames, mm.mean(axis=1), strict=True)))
+            print("   " + "  ".join(f"{f}: {value:.0f}" for f, value in zip(frames, by_frame, strict=True)))
     step = 1e3 * np.linalg.norm(np.diff(joints, axis=0), axis=-1)
     usual = 1e3 * np.linalg.norm(np.diff(load_reference(args.references[0])[frames], axis=0), axis=-1)
-    print(f"largest step of a joint from frame to frame: {np.nanmax(step):.0f} mm (reference {usual.max():.0f} mm)")
+    print(f"largest step of a joint between frames: {np.nanmax(step):.0f} mm (reference {np.nanmax(usual):.0f} mm)")
 
 
 if __name__ == "__main__":

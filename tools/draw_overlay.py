@@ -63,7 +63,8 @@ def main() -> int:
     except LimblocError as error:
         print(f"draw_overlay: {error}", file=sys.stderr)
         return 1
-    if not cv2.imwrite(str(args.out), picture, [cv2.IMWRITE_JPEG_QUALITY, 85]):
+    quality = [cv2.IMWRITE_JPEG_QUALITY, 85] if args.out.suffix.lower() in (".jpg", ".jpeg") else []
+    if not cv2.imwrite(str(args.out), picture, quality):
         print(f"draw_overlay: {args.out} cannot be written", file=sys.stderr)
         return 1
     print(f"frame {number} in {args.out}")
