@@ -93,7 +93,7 @@ def test_ctrl_c_keeps_what_is_done_and_the_same_command_goes_on(tmp_path):
         command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
     )
     assert "4 cameras" in process.stderr.readline()
-    time.sleep(4)  # loading kernels or fitting, both can be interrupted
+    time.sleep(1)  # loading kernels or fitting, both can be interrupted
     os.killpg(process.pid, signal.SIGINT)
     _, error = process.communicate(timeout=60)
     if process.returncode == 0:

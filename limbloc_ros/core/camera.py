@@ -51,7 +51,7 @@ class Camera:
         if self.K[0, 0] <= 0 or self.K[1, 1] <= 0:
             raise RigError(
                 f"camera {self.name}: K has focal lengths {self.K[0, 0]:g}, {self.K[1, 1]:g} px; expected positive "
-                "ones (all zero means that the driver has no calibration: run camera_calibration or set "
+                "ones (an all-zero K means that the driver has no calibration: run camera_calibration or set "
                 "camera_info_url)"
             )
         if self.distortion_model not in DISTORTION_COEFFICIENTS:
