@@ -360,7 +360,7 @@ def test_the_end_of_a_replay_ends_the_graph(tmp_path):
     plans = [plan("replay", replay, ends_graph=True), plan("cameras_1", segmentation("cam0"))]
     assert Supervisor(plans, graph_environment(NETWORK), FAST, lines.append).run() == 0
     assert any("replayed 3 messages" in line for line in lines)
-    assert lines[-1] == "replay has ended, and the smart space with it"
+    assert "replay has ended, and the smart space with it" in lines
 
 
 STUBBORN = """
