@@ -145,11 +145,14 @@ class Tracker:
 
     #: A cost this much above the usual one, or above this many m^2, is no longer believed ...
     DOUBT, DOUBTFUL_COST = 1.35, 4.5e-4
-    #: ... but while it stays high, starting anew is tried only every so many frames; limbs are checked as often.
-    PATIENCE = 5
+    #: ... but starting anew, which takes as long as many followed frames, is tried only every so many frames: in a
+    #: live room a slow fit makes the next step longer. Arms are checked as often.
+    PATIENCE = 8
+    #: What is searched when starting anew: less than for a frame alone, for the next frames can mend it.
+    SEARCH = Effort(torsos=4, finalists=2)
 
     def __init__(self, seed: int, weights: Weights | None = None, effort: Effort | None = None) -> None:
-        self._seed, self._weights, self._effort = seed, weights or Weights(), effort or Effort()
+        self._seed, self._weights, self._effort = seed, weights or Weights(), effort or self.SEARCH
         self.reset()
 
     def reset(self) -> None:
@@ -158,14 +161,18 @@ class Tracker:
         self._usual_cost = 0.0
         self._frame = 0
         self._last_scratch = -self.PATIENCE
+        self._centre = np.zeros(3)
 
     def follow(self, hull: Hull, surface: Surface) -> Fit | None:
         """Fit the next frame."""
         self._frame += 1
         fit: Fit | None = None
+        centre = surface.points.mean(axis=0)
+        moved, self._centre = centre - self._centre, centre
         if self._last is not None:
             evidence = gather_evidence(hull, surface, 600, np.random.default_rng(self._seed))
-            result = refine(self._last, evidence, self._weights, 10)
+            carried = FigureState(self._last.root + moved, self._last.rotations, self._last.shape)
+            result = refine(carried, evidence, self._weights, 10 if np.abs(moved).max() < 0.1 else 20)
             if self._frame % self.PATIENCE == 0:
                 result = self._check_arms(result, hull, evidence)
             fit = Fit(result.state, result.system, np.inf)
@@ -185,9 +192,7 @@ class Tracker:
 
     def _doubts(self, cost: float) -> bool:
         waited = self._frame - self._last_scratch >= self.PATIENCE
-        return cost > 2 * self.DOUBT * self._usual_cost or (
-            waited and (cost > self.DOUBT * self._usual_cost or cost > self.DOUBTFUL_COST)
-        )
+        return waited and (cost > self.DOUBT * self._usual_cost or cost > self.DOUBTFUL_COST)
 
     def _check_arms(self, result: lm.LmResult[FigureState], hull: Hull, evidence: Evidence) -> lm.LmResult[FigureState]:
         """An arm that has slipped into the trunk stays there, for its flesh is explained: look for it elsewhere."""
