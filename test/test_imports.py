@@ -27,6 +27,7 @@ CORE_ORDER = (
     "errors",
     "config",
     "camera",
+    "lens",
     "pose",
     "images",
     "synchroniser",

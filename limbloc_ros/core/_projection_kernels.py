@@ -1,0 +1,134 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Numba kernels that project points into cameras, and the table of cameras that they read (see `silhouettes`)."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from numba import njit
+
+# Columns of the packed camera table: R (9), t (3), fx fy cx cy, distortion kind, 14 coefficients, width, height, square
+# of the lens's range, the lens's largest enlargement (see `lens`).
+CAMERA_COLUMNS = 35
+NONE, POLYNOMIAL, FISHEYE = 0.0, 1.0, 2.0
+# How a block of space lies to a camera.
+UNKNOWN, UNSEEN, PARTLY, WITHIN = 0, 1, 2, 3
+#: Closer to a camera than this (m) nothing is bounded.
+CLOSEST = 0.05
+
+
+@njit(cache=True, inline="always")  # type: ignore[misc, unused-ignore]
+def distort(cams: Any, c: int, a: float, b: float) -> tuple[float, float]:
+    """Normalised coordinates in the lens's range -> pixel."""
+    kind = cams[c, 16]
+    if kind == 1.0:
+        k = cams[c, 17:31]
+        r2 = a * a + b * b
+        radial = (1.0 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))) / (1.0 + r2 * (k[5] + r2 * (k[6] + r2 * k[7])))
+        xx = a * radial + 2.0 * k[2] * a * b + k[3] * (r2 + 2.0 * a * a) + k[8] * r2 + k[9] * r2 * r2
+        b = b * radial + k[2] * (r2 + 2.0 * b * b) + 2.0 * k[3] * a * b + k[10] * r2 + k[11] * r2 * r2
+        a = xx
+    elif kind == 2.0:
+        k = cams[c, 17:31]
+        r = math.sqrt(a * a + b * b)
+        if r > 1e-9:
+            th = math.atan(r)
+            t2 = th * th
+            scale = th * (1.0 + t2 * (k[0] + t2 * (k[1] + t2 * (k[2] + t2 * k[3])))) / r
+            a *= scale
+            b *= scale
+    return cams[c, 12] * a + cams[c, 14], cams[c, 13] * b + cams[c, 15]
+
+
+@njit(cache=True, inline="always")  # type: ignore[misc, unused-ignore]
+def row_start(cams: Any, c: int, x: float, y: float) -> tuple[float, float, float]:
+    """The part of a point's camera coordinates that all points with the same x and y share."""
+    return (
+        cams[c, 0] * x + cams[c, 1] * y + cams[c, 9],
+        cams[c, 3] * x + cams[c, 4] * y + cams[c, 10],
+        cams[c, 6] * x + cams[c, 7] * y + cams[c, 11],
+    )
+
+
+@njit(cache=True, inline="always")  # type: ignore[misc, unused-ignore]
+def project(cams: Any, c: int, start: tuple[float, float, float], z: float) -> tuple[float, float, float]:
+    """World point, given as `row_start` and its z (m) -> pixel (u, v) and depth (m); depth 0 is not seen."""
+    depth = start[2] + cams[c, 8] * z
+    if depth <= 1e-6:
+        return 0.0, 0.0, 0.0
+    inverse = 1.0 / depth
+    a = (start[0] + cams[c, 2] * z) * inverse
+    b = (start[1] + cams[c, 5] * z) * inverse
+    if cams[c, 16] == 0.0:
+        return cams[c, 12] * a + cams[c, 14], cams[c, 13] * b + cams[c, 15], depth
+    if a * a + b * b > cams[c, 33]:
+        return 0.0, 0.0, 0.0
+    u, v = distort(cams, c, a, b)
+    return u, v, depth
+
+
+@njit(cache=True, inline="always")  # type: ignore[misc, unused-ignore]
+def view_of_ball(
+    cams: Any, c: int, x: float, y: float, z: float, radius: float
+) -> tuple[int, float, float, float, float]:
+    """How a ball (m) lies to a camera: UNSEEN or WITHIN the image wholly, PARTLY, or UNKNOWN.
+
+    With the latter two come the centre's pixel (u, v), `reach` (px) and the nearest depth (m): every point of the ball
+    is seen at most `reach` from (u, v). A point that is d from the centre differs from it by at most
+    d / nearest depth * sqrt(1 + a^2 + b^2) in normalised coordinates (a, b: those of the centre), and the lens enlarges
+    that by a known factor at most.
+    """
+    sx, sy, sz = row_start(cams, c, x, y)
+    depth = sz + cams[c, 8] * z
+    if depth < -radius:
+        return UNSEEN, 0.0, 0.0, 0.0, 0.0
+    near = depth - radius
+    if near < CLOSEST:
+        return UNKNOWN, 0.0, 0.0, 0.0, 0.0
+    a = (sx + cams[c, 2] * z) / depth
+    b = (sy + cams[c, 5] * z) / depth
+    off = a * a + b * b
+    reach = radius / near * math.sqrt(1.0 + off)
+    if cams[c, 16] != 0.0:
+        limit = math.sqrt(cams[c, 33])
+        off = math.sqrt(off)
+        if off - reach > limit:
+            return UNSEEN, 0.0, 0.0, 0.0, 0.0
+        if off + reach > limit:
+            return UNKNOWN, 0.0, 0.0, 0.0, 0.0
+        reach *= cams[c, 34]
+    u, v = distort(cams, c, a, b)
+    reach *= max(cams[c, 12], cams[c, 13])
+    right = cams[c, 31] - 1.0
+    bottom = cams[c, 32] - 1.0
+    if u < -reach or v < -reach or u > right + reach or v > bottom + reach:
+        return UNSEEN, 0.0, 0.0, 0.0, 0.0
+    if u < reach or v < reach or u > right - reach or v > bottom - reach:
+        return PARTLY, u, v, reach, near
+    return WITHIN, u, v, reach, near
+
+
+@njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def project_block(cams: Any, c: int, points: Any, seen: Any) -> None:
+    """Pixels u, v (rows 0 and 1 of `seen`) of points [3, P], and m per px there (row 2); 0 is not seen."""
+    fx, fy, cx, cy = cams[c, 12], cams[c, 13], cams[c, 14], cams[c, 15]
+    if cams[c, 16] != 0.0:
+        for m in range(points.shape[1]):
+            start = row_start(cams, c, points[0, m], points[1, m])
+            seen[0, m], seen[1, m], depth = project(cams, c, start, points[2, m])
+            seen[2, m] = depth / fx
+        return
+    # The same as `project`. With one array to read and one to write, and no branch, the loop becomes vector code.
+    r00, r01, r02, t0 = cams[c, 0], cams[c, 1], cams[c, 2], cams[c, 9]
+    r10, r11, r12, t1 = cams[c, 3], cams[c, 4], cams[c, 5], cams[c, 10]
+    r20, r21, r22, t2 = cams[c, 6], cams[c, 7], cams[c, 8], cams[c, 11]
+    for m in range(points.shape[1]):
+        x = points[0, m]
+        y = points[1, m]
+        z = points[2, m]
+        depth = r20 * x + r21 * y + t2 + r22 * z
+        inverse = 1.0 / depth
+        seen[0, m] = fx * ((r00 * x + r01 * y + t0 + r02 * z) * inverse) + cx
+        seen[1, m] = fy * ((r10 * x + r11 * y + t1 + r12 * z) * inverse) + cy
+        seen[2, m] = depth / fx if depth > 1e-6 else 0.0
