@@ -23,7 +23,7 @@ from limbloc_ros.core._projection_kernels import (
 SLACK_PX = 2.0
 
 
-@njit(cache=True, inline="always")  # type: ignore[misc, unused-ignore]
+@njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def read_piece(field: Any, offset: int, width: int, height: int, px: float, py: float, far: float) -> float:
     """Bilinear value of a stored piece at its pixel (px, py); `far` beyond it."""
     if px < 0.0 or py < 0.0 or px > width - 1 or py > height - 1:
@@ -41,7 +41,7 @@ def read_piece(field: Any, offset: int, width: int, height: int, px: float, py: 
     return value
 
 
-@njit(cache=True, inline="always")  # type: ignore[misc, unused-ignore]
+@njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def camera_distance(
     cams: Any, c: int, boxes: Any, field: Any, far: float, start: tuple[float, float, float], z: float
 ) -> float:
@@ -58,7 +58,7 @@ def camera_distance(
     return far if px == math.inf else px * (depth / cams[c, 12])
 
 
-@njit(cache=True, inline="always")  # type: ignore[misc, unused-ignore]
+@njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def block_ball(corner: Any, size: int, voxel: float) -> tuple[float, float, float, float]:
     """Centre (m) and radius of the ball around the voxel centres of a block, see `block_is_outside`."""
     half = 0.5 * size

@@ -18,7 +18,7 @@ UNKNOWN, UNSEEN, PARTLY, WITHIN = 0, 1, 2, 3
 CLOSEST = 0.05
 
 
-@njit(cache=True, inline="always")  # type: ignore[misc, unused-ignore]
+@njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def distort(cams: Any, c: int, a: float, b: float) -> tuple[float, float]:
     """Normalised coordinates in the lens's range -> pixel."""
     kind = cams[c, 16]
@@ -41,7 +41,7 @@ def distort(cams: Any, c: int, a: float, b: float) -> tuple[float, float]:
     return cams[c, 12] * a + cams[c, 14], cams[c, 13] * b + cams[c, 15]
 
 
-@njit(cache=True, inline="always")  # type: ignore[misc, unused-ignore]
+@njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def row_start(cams: Any, c: int, x: float, y: float) -> tuple[float, float, float]:
     """The part of a point's camera coordinates that all points with the same x and y share."""
     return (
@@ -51,7 +51,7 @@ def row_start(cams: Any, c: int, x: float, y: float) -> tuple[float, float, floa
     )
 
 
-@njit(cache=True, inline="always")  # type: ignore[misc, unused-ignore]
+@njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def project(cams: Any, c: int, start: tuple[float, float, float], z: float) -> tuple[float, float, float]:
     """World point, given as `row_start` and its z (m) -> pixel (u, v) and depth (m); depth 0 is not seen."""
     depth = start[2] + cams[c, 8] * z
@@ -68,7 +68,7 @@ def project(cams: Any, c: int, start: tuple[float, float, float], z: float) -> t
     return u, v, depth
 
 
-@njit(cache=True, inline="always")  # type: ignore[misc, unused-ignore]
+@njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def view_of_ball(
     cams: Any, c: int, x: float, y: float, z: float, radius: float
 ) -> tuple[int, float, float, float, float]:
@@ -113,13 +113,13 @@ def view_of_ball(
 def project_block(cams: Any, c: int, points: Any, seen: Any) -> None:
     """Pixels u, v (rows 0 and 1 of `seen`) of points [3, P], and m per px there (row 2); 0 is not seen."""
     fx, fy, cx, cy = cams[c, 12], cams[c, 13], cams[c, 14], cams[c, 15]
-    if cams[c, 16] != 0.0:
+    if cams[c, 16] == FISHEYE:
         for m in range(points.shape[1]):
             start = row_start(cams, c, points[0, m], points[1, m])
             seen[0, m], seen[1, m], depth = project(cams, c, start, points[2, m])
             seen[2, m] = depth / fx
         return
-    # The same as `project`. With one array to read and one to write, and no branch, the loop becomes vector code.
+    # The same as `project`. With one array to read and one to write, and no branch, these loops become vector code.
     r00, r01, r02, t0 = cams[c, 0], cams[c, 1], cams[c, 2], cams[c, 9]
     r10, r11, r12, t1 = cams[c, 3], cams[c, 4], cams[c, 5], cams[c, 10]
     r20, r21, r22, t2 = cams[c, 6], cams[c, 7], cams[c, 8], cams[c, 11]
@@ -129,6 +129,22 @@ def project_block(cams: Any, c: int, points: Any, seen: Any) -> None:
         z = points[2, m]
         depth = r20 * x + r21 * y + t2 + r22 * z
         inverse = 1.0 / depth
-        seen[0, m] = fx * ((r00 * x + r01 * y + t0 + r02 * z) * inverse) + cx
-        seen[1, m] = fy * ((r10 * x + r11 * y + t1 + r12 * z) * inverse) + cy
+        seen[0, m] = (r00 * x + r01 * y + t0 + r02 * z) * inverse
+        seen[1, m] = (r10 * x + r11 * y + t1 + r12 * z) * inverse
         seen[2, m] = depth / fx if depth > 1e-6 else 0.0
+    if cams[c, 16] == POLYNOMIAL:
+        k1, k2, p1, p2, k3 = cams[c, 17], cams[c, 18], cams[c, 19], cams[c, 20], cams[c, 21]
+        k4, k5, k6 = cams[c, 22], cams[c, 23], cams[c, 24]
+        s1, s2, s3, s4 = cams[c, 25], cams[c, 26], cams[c, 27], cams[c, 28]
+        limit = cams[c, 33]
+        for m in range(points.shape[1]):
+            a = seen[0, m]
+            b = seen[1, m]
+            r2 = a * a + b * b
+            radial = (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+            seen[0, m] = a * radial + 2.0 * p1 * a * b + p2 * (r2 + 2.0 * a * a) + s1 * r2 + s2 * r2 * r2
+            seen[1, m] = b * radial + p1 * (r2 + 2.0 * b * b) + 2.0 * p2 * a * b + s3 * r2 + s4 * r2 * r2
+            seen[2, m] = 0.0 if r2 > limit else seen[2, m]
+    for m in range(points.shape[1]):
+        seen[0, m] = fx * seen[0, m] + cx
+        seen[1, m] = fy * seen[1, m] + cy

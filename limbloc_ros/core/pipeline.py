@@ -124,4 +124,6 @@ def _warm_up_room() -> tuple[Rig, HullConfig]:
 def _warm_up_masks() -> dict[str, NDArray[np.uint8]]:
     mask = np.zeros((160, 160), np.uint8)
     mask[50:66, 73:87] = mask[66:110, 66:94] = mask[110:150, 68:78] = mask[110:150, 82:92] = 255
-    return {f"warm{i}": mask for i in range(3)}
+    one_legged = mask.copy()  # so that mending is compiled as well
+    one_legged[110:150, 82:92] = 0
+    return {"warm0": one_legged, "warm1": mask, "warm2": mask}

@@ -37,6 +37,7 @@ class Silhouettes:
         field: float32, the pieces one after the other.
         rejected: camera name -> why it does not take part.
         masks: the whole masks, uint8 [height, width], 0 or 1.
+        outlines: int64 [C, 4] first column and row, last column and row of each mask's foreground.
         margins: float64 [C] px from a mask to its piece's border: further out, every point that can matter is further
             from the silhouette than the band.
         room: float64 [2, 3] corners of the carve volume, m.
@@ -49,6 +50,7 @@ class Silhouettes:
     field: NDArray[np.float32]
     rejected: dict[str, str]
     masks: tuple[NDArray[np.uint8], ...]
+    outlines: NDArray[np.int64]
     margins: NDArray[np.float64]
     room: NDArray[np.float64]
     band_m: float
@@ -61,7 +63,13 @@ class Silhouettes:
     def with_masks(self, masks: Mapping[int, NDArray[np.uint8]]) -> Silhouettes:
         """The same with the whole masks (0 or 1) of some camera numbers replaced."""
         new = tuple(masks.get(c, mask) for c, mask in enumerate(self.masks))
-        return _cut(replace(self, masks=new), self)
+        outlines = self.outlines.copy()
+        for c, mask in masks.items():
+            outlines[c] = _outline(mask)
+        grown = replace(self, masks=new, outlines=outlines)
+        if not np.array_equal(outlines, self.outlines):
+            grown = replace(grown, margins=_margins(grown))
+        return _cut(grown, self)
 
     def without(self, name: str, why: str) -> Silhouettes:
         """The same without one camera."""
@@ -73,9 +81,10 @@ class Silhouettes:
             boxes=self.boxes[keep],
             rejected={**self.rejected, name: why},
             masks=tuple(self.masks[i] for i in keep),
+            outlines=self.outlines[keep],
             margins=self.margins[keep],
         )
-        return _cut(rest, rest)
+        return _cut(replace(rest, margins=_margins(rest)), rest)
 
     def changes_since(self, before: Silhouettes) -> NDArray[np.float64]:
         """Where another distance than before is read, if it is nearer than the margin; the masks may only have grown.
@@ -216,11 +225,12 @@ def measure_silhouettes(
         field=np.zeros(0, np.float32),
         rejected=rejected,
         masks=tuple(usable),
+        outlines=np.array([_outline(mask) for mask in usable], np.int64).reshape(-1, 4),
         margins=np.zeros(len(rows)),
         room=np.stack([rig.volume_min, rig.volume_max]),
         band_m=max(config.band_m, COARSE_BAND * config.voxel_m),
     )
-    return _cut(whole, None)
+    return _cut(replace(whole, margins=_margins(whole)), None) if rows else whole
 
 
 def min_seen(cameras: int) -> int:
@@ -231,29 +241,19 @@ def min_seen(cameras: int) -> int:
 def _cut(whole: Silhouettes, old: Silhouettes | None) -> Silhouettes:
     """Cut the piece that can matter out of every mask and measure it; `old` has pieces that may still do."""
     count = len(whole.names)
-    if count == 0:
-        return whole
-    outlines = np.array([cv2.boundingRect(mask) for mask in whole.masks], np.int64)
-    outlines[:, 2:] += outlines[:, :2] - 1
-    nearest = _nearest_depths(whole, outlines)
+    margins = whole.margins.copy()
     boxes = np.zeros((count, 5), np.int64)
-    margins = np.zeros(count)
     pieces = []
     offset = 0
     for c, mask in enumerate(whole.masks):
-        # Beyond this margin every point that can matter is further than the band from the outline.
-        focal = whole.cameras[c, 12]
-        margins[c] = max(mask.shape)
-        if nearest[c] > 0:
-            margins[c] = min(margins[c], math.ceil(focal * whole.band_m / nearest[c]) + 2)
         if old is not None and mask is old.masks[c] and margins[c] <= old.margins[c]:
             margins[c] = old.margins[c]
             boxes[c] = old.boxes[c]
             pieces.append(old.piece(c).ravel())
         else:
             margin = int(margins[c])
-            x0, y0 = np.maximum(outlines[c, :2] - margin, 0)
-            x1, y1 = np.minimum(outlines[c, 2:] + margin + 1, mask.shape[::-1])
+            x0, y0 = np.maximum(whole.outlines[c, :2] - margin, 0)
+            x1, y1 = np.minimum(whole.outlines[c, 2:] + margin + 1, mask.shape[::-1])
             boxes[c, :4] = x0, y0, x1 - x0, y1 - y0
             pieces.append(kernels.signed_distance(mask[y0:y1, x0:x1]).ravel())
         boxes[c, 4] = offset
@@ -261,16 +261,27 @@ def _cut(whole: Silhouettes, old: Silhouettes | None) -> Silhouettes:
     return replace(whole, boxes=boxes, margins=margins, field=np.concatenate(pieces))
 
 
-def _nearest_depths(whole: Silhouettes, outlines: NDArray[np.int64]) -> NDArray[np.float64]:
-    """How near to each camera [C] a wanted voxel can be, m, by the rectangles around the masks alone."""
-    table = (whole.cameras, outlines, whole.band_m, min_seen(len(whole.names)))
-    span = whole.room[1] - whole.room[0]
-    edge = max(CUBE_M, float(np.cbrt(span.prod() / MAX_CUBES)))
+def _outline(mask: NDArray[np.uint8]) -> tuple[int, int, int, int]:
+    """First column and row, last column and row of the foreground."""
+    x, y, width, height = cv2.boundingRect(mask)
+    return x, y, x + width - 1, y + height - 1
+
+
+def _margins(whole: Silhouettes) -> NDArray[np.float64]:
+    """Beyond these distances (px) from the masks [C] every point that can matter is further than the band from them.
+
+    The rectangles around the masks alone tell how near to each camera such a point can be.
+    """
+    table = (whole.cameras, whole.outlines, whole.band_m, min_seen(len(whole.names)))
     low, high = whole.room
+    edge = max(CUBE_M, float(np.cbrt((high - low).prod() / MAX_CUBES)))
     axes = [np.arange(low[a] + 0.5 * edge, high[a] + 0.5 * edge, edge) for a in range(3)]
     cubes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     eighths = np.array(list(np.ndindex(2, 2, 2))) - 0.5
     kept, _ = kernels.nearest_depths(cubes, 0.5 * edge * math.sqrt(3), *table)
     cubes = (cubes[kept][:, None] + 0.5 * edge * eighths).reshape(-1, 3)
     _, nearest = kernels.nearest_depths(cubes, 0.25 * edge * math.sqrt(3), *table)
-    return nearest  # type: ignore[no-any-return]
+    margins = np.array([float(max(mask.shape)) for mask in whole.masks])
+    seen = nearest > 0
+    margins[seen] = np.minimum(margins[seen], np.ceil(whole.cameras[seen, 12] * whole.band_m / nearest[seen]) + 2)
+    return margins
