@@ -27,6 +27,8 @@ class Camera:
         distortion: coefficients in OpenCV's order (k1 k2 p1 p2 [k3 ...]; fisheye k1..k4).
         distortion_model: `none`, `radtan` (plumb_bob), `rational` or `fisheye` (equidistant).
         T_world_camera: [4, 4] pose of the optical frame (x right, y down, z forward) in the world, m.
+        ignore: polygons [N, 2] in px where the camera's foreground means nothing (a screen, a window, a curtain): it
+            neither carves there nor is it held against others.
     """
 
     name: str
@@ -36,6 +38,7 @@ class Camera:
     T_world_camera: Array
     distortion: Array = field(default_factory=lambda: np.zeros(0))
     distortion_model: str = "none"
+    ignore: tuple[Array, ...] = ()
 
     def __post_init__(self) -> None:
         for name, shape in (("K", (3, 3)), ("T_world_camera", (4, 4)), ("distortion", None)):
@@ -65,6 +68,14 @@ class Camera:
                 f"camera {self.name}: {self.distortion_model} distortion takes {' or '.join(map(str, counts))} "
                 f"coefficients, got {self.distortion.size}"
             )
+        polygons = tuple(np.array(polygon, dtype=np.float64) for polygon in self.ignore)
+        for polygon in polygons:
+            if polygon.ndim != 2 or polygon.shape[1] != 2 or len(polygon) < 3 or not np.isfinite(polygon).all():
+                raise RigError(
+                    f"camera {self.name}: ignore takes polygons of three or more (x, y) in px, got {polygon.tolist()}"
+                )
+            polygon.setflags(write=False)
+        object.__setattr__(self, "ignore", polygons)
         R = self.T_world_camera[:3, :3]
         if np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0:
             raise RigError(f"camera {self.name}: the rotation of T_world_camera is not a right-handed rotation matrix")
@@ -77,6 +88,14 @@ class Camera:
         T[:3, :3] = R.T
         T[:3, 3] = -R.T @ self.T_world_camera[:3, 3]
         return T
+
+    def ignored_pixels(self) -> NDArray[np.uint8] | None:
+        """[height, width] 1 where the camera is to be ignored, 0 elsewhere; None without such regions."""
+        if not self.ignore:
+            return None
+        pixels = np.zeros((self.height, self.width), np.uint8)
+        outlines = [np.rint(polygon).astype(np.int32) for polygon in self.ignore]
+        return np.asarray(cv2.fillPoly(pixels, outlines, 1), dtype=np.uint8)
 
     def world_to_image(self, p_world: ArrayLike) -> tuple[Array, Array]:
         """Project world points.

@@ -197,11 +197,14 @@ def reject_dead_cameras(silhouettes: Silhouettes, rig: Rig, config: HullConfig) 
 
 
 def cover_silhouettes(silhouettes: Silhouettes, voxels: Voxels, config: HullConfig) -> NDArray[np.uint8]:
-    """Which pixels the hull's voxels project to; uint8 in the layout of `silhouettes.field`."""
+    """Which pixels the hull's voxels project to, or are to be ignored; uint8 in the layout of `silhouettes.field`."""
     indices, first, _, _ = voxels
     covered = np.zeros(silhouettes.field.size, np.uint8)
     centres = (np.ascontiguousarray(indices[first < 0].T) + 0.5) * config.voxel_m
     mending.cover(centres, 0.875 * config.voxel_m, silhouettes.cameras, silhouettes.boxes, covered)
+    for (x, y, width, height, offset), ignored in zip(silhouettes.boxes, silhouettes.ignored, strict=True):
+        if ignored is not None:
+            covered[offset : offset + width * height] |= ignored[y : y + height, x : x + width].ravel()
     return covered
 
 

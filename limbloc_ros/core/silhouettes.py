@@ -36,12 +36,14 @@ class Silhouettes:
         boxes: int64 [C, 5] x0, y0, width, height of each piece and its offset in `field`.
         field: float32, the pieces one after the other.
         rejected: camera name -> why it does not take part.
-        masks: the whole masks, uint8 [height, width], 0 or 1.
+        masks: the whole masks, uint8 [height, width], 0 or 1; regions to ignore are foreground, so that nothing is
+            carved there.
         outlines: int64 [C, 4] first column and row, last column and row of each mask's foreground.
         margins: float64 [C] px from a mask to its piece's border: further out, every point that can matter is further
             from the silhouette than the band.
         room: float64 [2, 3] corners of the carve volume, m.
         band_m: how far outside a silhouette distances are needed, m.
+        ignored: uint8 [height, width] of each camera, 1 where its image means nothing; None where it has no such part.
     """
 
     names: tuple[str, ...]
@@ -54,6 +56,7 @@ class Silhouettes:
     margins: NDArray[np.float64]
     room: NDArray[np.float64]
     band_m: float
+    ignored: tuple[NDArray[np.uint8] | None, ...]
 
     def piece(self, c: int) -> NDArray[np.float32]:
         """[height, width] the stored piece of camera number c, px."""
@@ -83,6 +86,7 @@ class Silhouettes:
             masks=tuple(self.masks[i] for i in keep),
             outlines=self.outlines[keep],
             margins=self.margins[keep],
+            ignored=tuple(self.ignored[i] for i in keep),
         )
         return _cut(replace(rest, margins=_margins(rest)), rest)
 
@@ -203,20 +207,23 @@ def measure_silhouettes(
                 f"got {'x'.join(map(str, mask.shape[::-1]))}; is the stream scaled, or the rig file another camera's?"
             )
     usable: list[NDArray[np.uint8]] = []
+    ignored: list[NDArray[np.uint8] | None] = []
     rows: list[int] = []
     rejected: dict[str, str] = {}
     for row, camera in enumerate(rig.cameras):
         if camera.name not in masks:
             rejected[camera.name] = "no mask"
             continue
-        mask = cleaned(masks[camera.name])
+        blind = camera.ignored_pixels()
+        mask = cleaned(masks[camera.name] if blind is None else np.where(blind, np.uint8(0), masks[camera.name]))
         foreground = cv2.countNonZero(mask)
         if foreground == 0:
             rejected[camera.name] = "empty mask"
         elif foreground > 0.9 * mask.size:
             rejected[camera.name] = "mask is all foreground"
         else:
-            usable.append(mask)
+            usable.append(mask if blind is None else mask | blind)
+            ignored.append(blind)
             rows.append(row)
     whole = Silhouettes(
         names=tuple(rig.cameras[row].name for row in rows),
@@ -229,6 +236,7 @@ def measure_silhouettes(
         margins=np.zeros(len(rows)),
         room=np.stack([rig.volume_min, rig.volume_max]),
         band_m=max(config.band_m, COARSE_BAND * config.voxel_m),
+        ignored=tuple(ignored),
     )
     return _cut(replace(whole, margins=_margins(whole)), None) if rows else whole
 

@@ -210,7 +210,10 @@ def file_identity(path: Path) -> list[Any]:
 def rig_identity(rig: Rig) -> list[Any]:
     """Plain values that change when a rig does."""
     cameras = [
-        [c.name, c.width, c.height, c.K.tolist(), c.distortion_model, c.distortion.tolist(), c.T_world_camera.tolist()]
+        [
+            *(c.name, c.width, c.height, c.K.tolist(), c.distortion_model, c.distortion.tolist()),
+            *(c.T_world_camera.tolist(), [polygon.tolist() for polygon in c.ignore]),
+        ]
         for c in rig.cameras
     ]
     return [cameras, rig.volume_min.tolist(), rig.volume_max.tolist()]

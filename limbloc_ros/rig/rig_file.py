@@ -18,6 +18,9 @@ Our own format is YAML (see `docs/rig_file.md` for a commented example)::
         T_world_camera:            # pose of the optical frame (x right, y down, z forward); or a 4x4 matrix
           translation: [2.0, 0.0, 1.5]
           quaternion: [0.5, 0.5, -0.5, -0.5]                     # x y z w
+        ignore:                    # optional: polygons of pixels where foreground means nothing (a screen, a window)
+          - [[10, 20], [110, 20], [110, 90], [10, 90]]
+        ignore_mask: masks/cam0.png   # or a picture of the camera's size beside this file; not black = ignore
 
 A benchmark's `calib.json` (`R`, `t` with x_cam = R X + t, and `dist`) is read by the same function.
 """
@@ -29,6 +32,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import yaml
 from numpy.typing import NDArray
@@ -51,7 +55,7 @@ MODEL_ALIASES = {
 }
 
 _RIG_KEYS = ("version", "units", "volume", "cameras")
-_CAMERA_KEYS = ("name", "width", "height", "K", "distortion_model", "distortion", "T_world_camera")
+_CAMERA_KEYS = ("name", "width", "height", "K", "distortion_model", "distortion", "T_world_camera", "ignore", "ignore_mask")
 
 
 def load_rig(path: str | Path) -> Rig:
@@ -72,7 +76,7 @@ def load_rig(path: str | Path) -> Rig:
         raise RigError(f"rig file {path}: expected UTF-8 text, got other bytes at position {error.start}") from None
     except OSError as error:
         raise RigError(f"rig file {path} cannot be read: {error.strerror}") from None
-    return rig_from_mapping(_parse(text, path), str(path))
+    return rig_from_mapping(_parse(text, path), str(path), path.parent)
 
 
 def _parse(text: str, path: Path) -> Any:
@@ -91,12 +95,13 @@ def _parse(text: str, path: Path) -> Any:
         raise RigError(f"rig file {path}: not valid YAML: {error}") from None
 
 
-def rig_from_mapping(data: Any, source: str = "rig") -> Rig:
+def rig_from_mapping(data: Any, source: str = "rig", folder: Path | None = None) -> Rig:
     """Build the rig from the plain values of a rig file.
 
     Args:
         data: what YAML or JSON made of the file.
         source: how messages call the file.
+        folder: where the pictures of regions to ignore are looked for; the working folder if None.
 
     Raises:
         RigError: which key, what was expected, what came.
@@ -120,9 +125,11 @@ def rig_from_mapping(data: Any, source: str = "rig") -> Rig:
             raise RigError(
                 f"{source}: key units: expected m (metres), got {data['units']!r}; convert the file to metres"
             )
-    read = _benchmark_camera if benchmark else _our_camera
     try:
-        cameras = tuple(read(entry, at) for entry, at in zip(entries, where, strict=True))
+        cameras = tuple(
+            _benchmark_camera(entry, at) if benchmark else _our_camera(entry, at, folder or Path())
+            for entry, at in zip(entries, where, strict=True)
+        )
         low, high = _volume(data["volume"], source) if "volume" in data else derive_volume(cameras)
         return Rig(cameras, low, high)
     except RigError as error:
@@ -155,6 +162,8 @@ def save_rig(rig: Rig, path: str | Path) -> None:
             f"    distortion: {_row(camera.distortion)}",
             "    T_world_camera:",
             *(f"      - {_row(row)}" for row in camera.T_world_camera),
+            *(["    ignore:"] if camera.ignore else []),
+            *(f"      - [{', '.join(_row(point) for point in polygon)}]" for polygon in camera.ignore),
         ]
     try:
         Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")
@@ -162,7 +171,7 @@ def save_rig(rig: Rig, path: str | Path) -> None:
         raise RigError(f"rig file {path} cannot be written: {error.strerror}") from None
 
 
-def _our_camera(entry: Mapping[str, Any], at: str) -> Camera:
+def _our_camera(entry: Mapping[str, Any], at: str, folder: Path) -> Camera:
     name = _name(entry, at)
     at = f"{at} ({name})"
     _known_keys(entry, _CAMERA_KEYS, at)
@@ -171,15 +180,49 @@ def _our_camera(entry: Mapping[str, Any], at: str) -> Camera:
     if not isinstance(model, str) or MODEL_ALIASES.get(model, model) not in DISTORTION_COEFFICIENTS:
         names = ", ".join([*DISTORTION_COEFFICIENTS, *(alias for alias in MODEL_ALIASES if alias)])
         raise RigError(f"{at}: key distortion_model: expected one of {names}, got {_kind(model)}")
+    width, height = _pixels(entry, "width", at), _pixels(entry, "height", at)
+    ignore = _polygons(entry.get("ignore", []), f"{at}: key ignore")
+    if "ignore_mask" in entry:
+        ignore += _mask_polygons(entry["ignore_mask"], folder, (width, height), f"{at}: key ignore_mask")
     return Camera(
         name,
-        _pixels(entry, "width", at),
-        _pixels(entry, "height", at),
+        width,
+        height,
         _intrinsics(entry, at),
         _camera_pose(_required(entry, "T_world_camera", at), at),
         coefficients,
         MODEL_ALIASES.get(model, model),
+        tuple(ignore),
     )
+
+
+def _polygons(value: Any, at: str) -> list[Array]:
+    """Polygons of pixels, [N, 2] each."""
+    if not isinstance(value, Sequence) or isinstance(value, str):
+        raise RigError(f"{at}: expected a list of polygons [[x, y], [x, y], [x, y], ...], got {_kind(value)}")
+    polygons = [_numbers(polygon, None, f"{at}[{i}]", pairs=True) for i, polygon in enumerate(value)]
+    for i, polygon in enumerate(polygons):
+        if len(polygon) < 3:
+            raise RigError(f"{at}[{i}]: expected three or more points [x, y] in px, got {polygon.tolist()}")
+    return polygons
+
+
+def _mask_polygons(value: Any, folder: Path, size: tuple[int, int], at: str) -> list[Array]:
+    """The outlines of what is not black in a picture: filled, they give the same pixels again."""
+    if not isinstance(value, str) or not value:
+        raise RigError(f"{at}: expected the path of a picture, got {_kind(value)}")
+    path = folder / value
+    picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if path.is_file() else None
+    if picture is None:
+        raise RigError(f"{at}: {path} is missing or no picture; expected a PNG, white where the camera is to be ignored")
+    if picture.shape != size[::-1]:
+        raise RigError(
+            f"{at}: {path}: expected {size[0]}x{size[1]} px like the camera's images, got "
+            f"{picture.shape[1]}x{picture.shape[0]}"
+        )
+    outlines, _ = cv2.findContours((picture > 0).astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
+    # An outline of one or two pixels is closed by repeating them.
+    return [np.resize(o[:, 0].astype(np.float64), (max(len(o), 3), 2)) for o in outlines]
 
 
 def _benchmark_camera(entry: Mapping[str, Any], at: str) -> Camera:
@@ -272,8 +315,8 @@ def _known_keys(entry: Mapping[str, Any], known: Sequence[str], at: str) -> None
             raise RigError(f"{at}: unknown key {key!r}; expected {', '.join(known)}")
 
 
-def _numbers(value: Any, shape: tuple[int, ...] | None, at: str) -> Array:
-    """Plain values -> array of `shape` (a flat list of the right length will do; None: any flat list)."""
+def _numbers(value: Any, shape: tuple[int, ...] | None, at: str, pairs: bool = False) -> Array:
+    """Plain values -> array of `shape` (a flat list of the right length will do; None: any flat list, or pairs)."""
     expected = "a list of numbers" if shape is None else f"{'x'.join(map(str, shape))} numbers"
     try:
         array = (
@@ -284,7 +327,8 @@ def _numbers(value: Any, shape: tuple[int, ...] | None, at: str) -> Array:
     if array is None:
         raise RigError(f"{at}: expected {expected}, got {_kind(value)}")
     if shape is None:
-        shape = (array.size,)
+        expected = "pairs of numbers" if pairs else expected
+        shape = (array.size // 2, 2) if pairs else (array.size,)
     if array.shape != shape and array.shape != (int(np.prod(shape)),):
         raise RigError(f"{at}: expected {expected}, got {'x'.join(map(str, array.shape))}")
     if not np.isfinite(array).all():
