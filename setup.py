@@ -53,7 +53,9 @@ setup(
             "mypy==2.4.1",
             "types-PyYAML",
             "scipy-stubs",
+            "ezc3d>=1.5,<2",
         ],
+        "export": ["ezc3d>=1.5,<2"],  # C3D; the other formats need nothing
         "viewer": ["open3d-cpu>=0.19,<0.21"],
     },
     zip_safe=False,

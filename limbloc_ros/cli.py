@@ -21,6 +21,7 @@ COMMANDS = {
     "replay": "play a bag into the running graph",
     "record": "record the running graph into a bag",
     "report": "make pictures and a page of a finished run",
+    "export": "write a finished run for other programs: CSV, TRC, C3D, BVH, glTF, PLY, video",
 }
 
 EPILOG = """\

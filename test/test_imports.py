@@ -16,10 +16,11 @@ ALLOWED = {
     "rig": {"core"},
     "simulation": {"core", "rig"},
     "recordings": {"core", "rig"},
-    "report": {"core", "rig", "recordings"},
+    "export": {"core", "rig", "recordings"},
+    "report": {"core", "rig", "recordings", "export"},
     "ros": {"core", "rig", "recordings"},
     "nodes": {"core", "rig", "simulation", "recordings", "ros"},
-    "commands": {"core", "rig", "simulation", "recordings", "report", "ros", "nodes"},
+    "commands": {"core", "rig", "simulation", "recordings", "export", "report", "ros", "nodes"},
 }
 
 #: Modules of the core, as the data flows; each may import only what stands before it.
@@ -78,7 +79,8 @@ OUTSIDE = {
     "rig": NUMERIC | {"yaml"},
     "simulation": NUMERIC,
     "recordings": NUMERIC | {"yaml", "rosbags"},
-    "report": NUMERIC | {"matplotlib", "mpl_toolkits"},
+    "export": NUMERIC | {"ezc3d"},
+    "report": NUMERIC | {"matplotlib", "mpl_toolkits", "open3d"},
     "ros": NUMERIC | ROS,
     "nodes": NUMERIC | ROS | {"yaml"},
     "commands": NUMERIC | ROS | {"yaml", "tqdm"},

@@ -8,9 +8,11 @@ from limbloc_ros.core.camera import Camera, Rig
 from limbloc_ros.core.errors import InputError
 from limbloc_ros.core.hull import Hull
 from limbloc_ros.core.pose import JOINT, JOINT_NAMES, STICK_BONES
+from limbloc_ros.export.hull_surface import vertex_normals
+from limbloc_ros.export.stick_drawing import BRIGHT, draw_stick
 from limbloc_ros.report._renderer_kernels import rasterise
-from limbloc_ros.report.mesh import Mesh, balls, capsule, hull_mesh, stick_mesh, vertex_normals, with_field
-from limbloc_ros.report.overlay import BRIGHT, draw_stick, overlay_montage
+from limbloc_ros.report.mesh import Mesh, balls, capsule, hull_mesh, stick_mesh, with_field
+from limbloc_ros.report.overlay import overlay_montage
 from limbloc_ros.report.renderer import Layer, background, look_at, render
 
 RED, BLUE = (1.0, 0.1, 0.1), (0.1, 0.1, 1.0)

@@ -15,7 +15,8 @@ from limbloc_ros.core.camera import Camera
 from limbloc_ros.core.figure import BONE_NAMES, FigureState, Placed, place
 from limbloc_ros.core.joint_angles import NATIVE_ANGLES, native_rotations
 from limbloc_ros.core.pose import JOINT_NAMES
-from limbloc_ros.report.mesh import Mesh, capsule, flesh_figure_mesh, side_of, stick_mesh
+from limbloc_ros.export.stick_drawing import side_of
+from limbloc_ros.report.mesh import Mesh, capsule, flesh_figure_mesh, stick_mesh
 from limbloc_ros.report.renderer import Layer, look_at, render
 
 SIZE_PX = (760, 1000)

@@ -17,9 +17,10 @@ import cv2
 
 from limbloc_ros.core.errors import InputError, LimblocError
 from limbloc_ros.core.pose import Pose
+from limbloc_ros.export.stick_drawing import Image
 from limbloc_ros.recordings.kept_frames import KeptFrames
 from limbloc_ros.recordings.results import Run
-from limbloc_ros.report.overlay import Image, overlay_montage
+from limbloc_ros.report.overlay import overlay_montage
 from limbloc_ros.rig.rig_file import load_rig
 
 

@@ -13,14 +13,11 @@ from scipy.spatial import cKDTree
 from limbloc_ros.core.flesh_mesh import flesh_mesh, icosphere, support_points
 from limbloc_ros.core.hull import Hull
 from limbloc_ros.core.pose import JOINT, JOINT_NAMES, STICK_BONES, Array, Flesh
+from limbloc_ros.export.hull_surface import hull_surface
+from limbloc_ros.export.stick_drawing import side_of
 
 #: The person's own left, right and middle, from the Okabe-Ito palette that colour-blind people can tell apart.
 SIDE_COLOURS = {"L": (0.0, 0.447, 0.698), "R": (0.835, 0.369, 0.0), "": (0.25, 0.27, 0.30)}
-
-
-def side_of(name: str) -> str:
-    """`L` or `R` for the person's own side of a joint, bone or part, empty for the middle."""
-    return name[-1] if name.endswith(("_L", "_R")) else ""
 
 
 @dataclass(frozen=True)
@@ -68,52 +65,9 @@ class Mesh:
 
 
 def hull_mesh(hull: Hull, colour: ArrayLike = (0.62, 0.68, 0.75)) -> Mesh:
-    """The hull's surface, where its signed distance is zero (surface nets).
-
-    Every cell of 2 x 2 x 2 voxel centres that the surface crosses gets one vertex, the mean of the crossings on its
-    edges; every lattice edge that the surface crosses gets one quad between the four cells around it.
-    """
-    phi = np.pad(hull.sdf.astype(np.float64), 1, constant_values=hull.band_m)
-    origin = (np.asarray(hull.index_min) - 0.5) * hull.voxel_m  # centre of the padded array's first voxel
-    inside = phi < 0
-    cells = np.array(phi.shape) - 1
-    total, count = np.zeros((*cells, 3)), np.zeros(cells)
-    quads = []
-    for axis in range(3):
-        low = tuple(slice(None, -1) if a == axis else slice(None) for a in range(3))
-        high = tuple(slice(1, None) if a == axis else slice(None) for a in range(3))
-        at = np.argwhere(inside[low] != inside[high])
-        start, end = phi[low][tuple(at.T)], phi[high][tuple(at.T)]
-        crossing = at.astype(np.float64)
-        crossing[:, axis] += start / (start - end)
-        others = [a for a in range(3) if a != axis]
-        around = []
-        for step in ((0, 0), (-1, 0), (-1, -1), (0, -1)):
-            cell = at.copy()
-            cell[:, others] += step
-            np.add.at(total, tuple(cell.T), crossing)
-            np.add.at(count, tuple(cell.T), 1.0)
-            around.append(np.ravel_multi_index(tuple(cell.T), tuple(cells)))
-        quad = np.stack(around, axis=1)
-        # The four cells run clockwise about +x and +z but, because of the order of `others`, not about +y.
-        flip = (start < 0) != (axis == 1)
-        quads.append(np.where(flip[:, None], quad, quad[:, ::-1]))
-    used = np.flatnonzero(count)
-    number = np.full(count.size, -1)
-    number[used] = np.arange(len(used))
-    vertices = origin + hull.voxel_m * (total.reshape(-1, 3)[used] / count.reshape(-1)[used, None])
-    quad = number[np.concatenate(quads)]
-    faces = np.concatenate([quad[:, [0, 1, 2]], quad[:, [0, 2, 3]]])
-    return Mesh.of(vertices, faces, vertex_normals(vertices, faces), colour)
-
-
-def vertex_normals(vertices: Array, faces: NDArray[np.int64]) -> Array:
-    """[V, 3] unit normals: the mean of the adjoining faces, weighted by area."""
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    normals = np.zeros_like(vertices)
-    for i in range(3):
-        np.add.at(normals, faces[:, i], np.cross(b - a, c - a))
-    return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30))
+    """The hull's surface, where its signed distance is zero."""
+    vertices, faces, normals = hull_surface(hull)
+    return Mesh.of(vertices, faces, normals, colour)
 
 
 def with_field(mesh: Mesh, points: Array, field: Array) -> Mesh:

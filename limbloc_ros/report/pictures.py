@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 
 from limbloc_ros.core.camera import Camera
 from limbloc_ros.core.pose import JOINT, Array
+from limbloc_ros.export.stick_drawing import side_of
 from limbloc_ros.report.mesh import (
     SIDE_COLOURS,
     Mesh,
@@ -21,7 +22,6 @@ from limbloc_ros.report.mesh import (
     flesh_figure_mesh,
     hull_mesh,
     needles,
-    side_of,
     stick_mesh,
     with_field,
 )
