@@ -196,7 +196,7 @@ def test_a_looped_bag_goes_on_after_the_jump_back(graph: Graph, rig: Rig, rig_fi
 def test_a_slow_machine_skips_whole_sets_and_carves_the_newest(
     graph: Graph, rig: Rig, rig_file: str, person: Masks
 ) -> None:
-    node = graph.add(CarvingNode, rig_file=rig_file)
+    node = graph.add(CarvingNode, rig_file=rig_file, catch_up_s=3 * FRAME_NS / 1e9)
     cameras = Cameras(graph, rig.names)
     fast, seen = node.carver.carve, []
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import time
 from array import array
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,10 +18,12 @@ from ros_graph import Graph
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_srvs.srv import SetBool, Trigger
 
+from limbloc_ros.core.background import Segmentation
 from limbloc_ros.core.errors import ConfigError, InputError
 from limbloc_ros.nodes.segmentation import SegmentationNode
 from limbloc_ros.nodes.simulated_cameras import SimulatedCamerasNode
 from limbloc_ros.rig.rig_file import load_rig
+from limbloc_ros.ros import topics
 from limbloc_ros.ros.image_messages import (
     info_to_camera,
     message_to_mask,
@@ -126,6 +129,46 @@ def test_segmentation_recaptures_and_freezes_its_background(graph: Graph) -> Non
     assert not send(True, LEARNING).any()  # now the box is background
     assert not send(True, 1).any()
     assert send(False, 1).any()
+
+
+def test_an_overloaded_camera_makes_all_skip_the_same_images(graph: Graph) -> None:
+    """cam0's segmentation is slow. cam1 keeps up, but masks of one camera alone are worth nothing: whole sets go."""
+    names = ("cam0", "cam1")
+    nodes = {}
+    for name in names:
+        nodes[name] = graph.add(
+            SegmentationNode,
+            f"segmentation_{name}",
+            camera=name,
+            reliability="reliable",
+            catch_up_s=3.5 * FRAME_NS / 1e9,
+        )
+    masks = {name: graph.collect(CompressedImage, f"{name}/mask/compressed", topics.WORK_QOS) for name in names}
+    images = {name: graph.publisher(Image, f"{name}/image_raw", topics.WORK_QOS) for name in names}
+    graph.until(lambda: all(node.skips.get_subscription_count() == 2 for node in nodes.values()))
+    diagnostics = graph.diagnostics()
+    picture = Room().picture(box=False)
+    fast = nodes["cam0"].model.segment
+
+    def slow(pixels: np.ndarray) -> Segmentation:
+        if nodes["cam0"].meter.count == 0:  # images of both cameras come while cam0 is busy with its first one
+            for n in range(1, 9):
+                for name in names:
+                    images[name].publish(pixels_to_image(picture, header(n)))
+            time.sleep(0.4)
+        return fast(pixels)
+
+    nodes["cam0"].model.segment = slow
+    images["cam0"].publish(pixels_to_image(picture, header(0)))
+    last = stamp_ns(header(8))
+    graph.until(lambda: all(masks[name] and stamp_ns(masks[name][-1].header) == last for name in names))
+    graph.until(lambda: int(diagnostics.value("segmentation_cam0: mask", "images_skipped") or 0) > 0)
+    stamps = {name: [stamp_ns(msg.header) for msg in masks[name]] for name in names}
+    assert stamps["cam0"][1:] == stamps["cam1"]
+    skipped = nodes["cam0"].backlog.skipped
+    assert skipped == 9 - len(stamps["cam0"]) >= 4
+    assert diagnostics.value("segmentation_cam0: mask", "images_skipped") == str(skipped)
+    assert "too slow" in nodes["cam0"].backlog.behind
 
 
 @pytest.mark.parametrize(

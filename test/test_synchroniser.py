@@ -221,3 +221,21 @@ def test_bad_arguments_are_named():
         make(slop_s=float("nan"))
     with pytest.raises(InputError, match=r"'d'.*a, b, c"):
         make().add("d", 0, None)
+
+
+def test_frames_that_some_cameras_skipped_are_skipped_for_all():
+    sync = make()
+    stream = frames(3)
+    assert run_without_flush(sync, stream[:1]) == []  # a sent instant 0, b and c skip it
+    first, second = 1_000 * PERIOD, 1_001 * PERIOD
+    sync.skip_until(first + 4 * MS)
+    assert (sync.waiting, sync.counters.skipped) == (0, 1)
+    sets = run_without_flush(sync, stream[1:])  # what still comes of instant 0 opens no set
+    assert [(s.stamp_ns, s.missing) for s in sets] == [(second, ()), (second + PERIOD, ())]
+    assert sync.counters.late == {"a": 0, "b": 1, "c": 1}
+    sync.skip_until(first)  # told by another camera, late: nothing to do
+    assert sync.counters.skipped == 1
+
+
+def run_without_flush(sync, stream):
+    return [done for name, stamp, item in stream for done in sync.add(name, stamp, item)]

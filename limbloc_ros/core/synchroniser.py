@@ -56,13 +56,14 @@ class SyncCounters:
         received, missing, late, duplicate: by camera: frames added; sets handed on or dropped without it; frames
             that came after their set had left (or from before a jump in time, or the first one of a camera that comes
             back from silence); frames with a stamp the camera had sent already.
-        resets: jumps back in time.
+        resets: jumps back in time. skipped: sets thrown away by `skip_until`.
     """
 
     complete: int = 0
     incomplete: int = 0
     dropped: int = 0
     resets: int = 0
+    skipped: int = 0
     received: dict[str, int] = field(default_factory=dict)
     missing: dict[str, int] = field(default_factory=dict)
     late: dict[str, int] = field(default_factory=dict)
@@ -204,6 +205,15 @@ class StampSynchroniser(Generic[T]):
         while self._open:
             finished += self._leave()
         return finished
+
+    def skip_until(self, stamp_ns: int) -> None:
+        """Some cameras left out their frames up to this stamp (ns): drop waiting sets up to it, and what comes later."""
+        if self._left_ns is not None and stamp_ns <= self._left_ns:
+            return
+        kept = [s for s in self._open if s.low_ns > stamp_ns]
+        self.counters.skipped += len(self._open) - len(kept)
+        self._open = kept
+        self._left_ns, self._left_low_ns, self._left_names = stamp_ns, stamp_ns, frozenset(self.names)
 
     def reset(self) -> None:
         """Forget all waiting sets and the cameras' last stamps; the counters stay."""

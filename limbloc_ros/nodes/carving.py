@@ -13,6 +13,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from sensor_msgs.msg import CompressedImage, Image, PointCloud2
+from std_msgs.msg import Header
 
 from limbloc_ros.core.camera import Rig
 from limbloc_ros.core.config import HullConfig, SyncConfig, setting
@@ -21,17 +22,15 @@ from limbloc_ros.core.images import Pixels
 from limbloc_ros.core.pipeline import Carver
 from limbloc_ros.core.synchroniser import FrameSet, StampSynchroniser
 from limbloc_ros.ros import cloud_messages, image_messages, node_main, topics
+from limbloc_ros.ros.backlog import Backlog
 from limbloc_ros.ros.carving_report import CarvingReport
 from limbloc_ros.ros.health import Health
 from limbloc_ros.ros.messages import make_header, stamp_ns
 from limbloc_ros.ros.parameters import NodeParameters
 from limbloc_ros.ros.rig_source import RigFromTopics, rig_from_file
 
-#: How often waiting sets are looked at.
-TICK_S = 0.005
-#: Finished sets that may wait to be carved. Older ones are skipped as a whole: when the machine is too slow, all
-#: cameras must lose the same frames, or the sets that are carved lack some of them.
-BACKLOG = 2
+#: How often it is seen whether a set has waited long enough for its last cameras.
+TICK_S = 0.02
 
 #: Once per process, however many nodes are composed in it.
 warm_up = functools.cache(Carver.warm_up)
@@ -47,6 +46,13 @@ class CarvingSettings:
     world_frame: str = setting("room", "TF frame of the world, in which the hull is published")
     volume_min: tuple[float, ...] = setting((), "lower corner of the carve volume without a rig file", unit="m")
     volume_max: tuple[float, ...] = setting((), "upper corner; both empty: what the cameras see", unit="m")
+    catch_up_s: float = setting(
+        1.0,
+        "sets of masks may wait this long, by their stamps, for a slow moment to pass; then only the newest is carved",
+        unit="s",
+        low=0.0,
+        high=10.0,
+    )
 
 
 class CarvingNode(Node):
@@ -63,8 +69,8 @@ class CarvingNode(Node):
         self.carver: Carver | None = None
         self.rig_source: RigFromTopics | None = None
         self.synchroniser: StampSynchroniser[Pixels] | None = None
-        self.finished: list[FrameSet[Pixels]] = []
         warm_up()
+        self.backlog: Backlog[FrameSet[Pixels]] = Backlog(self, self.carve, self.settings.catch_up_s)
         self.hull = self.create_publisher(PointCloud2, topics.HULL, topics.STREAM_QOS)
         s = self.settings
         if s.rig_file:
@@ -79,7 +85,8 @@ class CarvingNode(Node):
         self.health = Health(self, self.describe)
         kind = Image if s.mask_transport == "raw" else CompressedImage
         for name, topic in mask_topics.items():
-            self.create_subscription(kind, topic, self.make_callback(name), topics.MASK_QOS)
+            self.create_subscription(kind, topic, self.make_callback(name), topics.WORK_QOS)
+        self.create_subscription(Header, topics.FRAMES_SKIPPED, self.on_skipped, topics.STREAM_QOS)
         self.create_timer(TICK_S, self.on_tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def mask_topic(self, camera: str) -> str:
@@ -90,7 +97,7 @@ class CarvingNode(Node):
     def use_rig(self, rig: Rig) -> None:
         """Carve with this rig from now on."""
         self.rig = rig
-        self.finished.clear()
+        self.backlog.clear()
         self.carver = Carver(rig, self.hull_config)
         self.synchroniser = StampSynchroniser.from_config(rig.names, self.sync_config, self.hull_config.min_cameras)
         self.get_logger().info(f"carving with {len(rig.cameras)} cameras: {', '.join(rig.names)}")
@@ -100,7 +107,7 @@ class CarvingNode(Node):
         return lambda msg: self.on_mask(camera, msg)
 
     def on_mask(self, camera: str, msg: Image | CompressedImage) -> None:
-        """One mask: into the synchroniser. Carving is left to the timer, so that masks never wait behind it."""
+        """One mask: into the synchroniser, and what that finishes into the backlog."""
         if self.rig is None or self.synchroniser is None or camera not in self.rig.names:
             return  # the diagnostics say what is missing of the rig
         with self.health.guard(f"camera {camera}"):
@@ -113,18 +120,22 @@ class CarvingNode(Node):
                 )
             stamp = stamp_ns(msg.header)
             self.report.mask(camera, mask, self.health.latency_s(stamp))
-            self.finished += self.synchroniser.add(camera, stamp, mask, time.monotonic_ns())
+            self.put_by(self.synchroniser.add(camera, stamp, mask, time.monotonic_ns()))
 
     def on_tick(self) -> None:
-        """Let incomplete sets go when their time is up, and carve a finished one."""
-        if self.synchroniser is None:
-            return
-        self.finished += self.synchroniser.tick(time.monotonic_ns())
-        if len(self.finished) > BACKLOG:
-            self.report.skipped += len(self.finished) - BACKLOG
-            del self.finished[:-BACKLOG]
-        if self.finished:
-            self.carve(self.finished.pop(0))
+        """Let incomplete sets go when their time is up."""
+        if self.synchroniser is not None:
+            self.put_by(self.synchroniser.tick(time.monotonic_ns()))
+
+    def on_skipped(self, msg: Header) -> None:
+        """A camera's segmentation is behind and skipped its images up to this stamp, and so do the others."""
+        if self.synchroniser is not None:
+            self.synchroniser.skip_until(stamp_ns(msg))
+
+    def put_by(self, finished: Sequence[FrameSet[Pixels]]) -> None:
+        """Sets to be carved, oldest first, when no mask waits to be taken."""
+        for frames in finished:
+            self.backlog.add(frames.stamp_ns, frames)
 
     def carve(self, frames: FrameSet[Pixels]) -> None:
         """Carve one set and publish its hull."""
@@ -142,7 +153,8 @@ class CarvingNode(Node):
 
     def describe(self) -> Sequence[DiagnosticStatus]:
         """The hull, and one entry per camera."""
-        return self.report.statuses(self.synchroniser, self.rig_source.problems if self.rig_source else {})
+        problems = self.rig_source.problems if self.rig_source else {}
+        return self.report.statuses(self.synchroniser, self.backlog, problems)
 
     def _on_hull_config(self, config: HullConfig) -> None:
         self.hull_config = config

@@ -25,6 +25,7 @@ from limbloc_ros.core.pose import Pose
 from limbloc_ros.core.surface import extract_surface
 from limbloc_ros.core.synchroniser import JUMP_S
 from limbloc_ros.ros import messages, node_main, topics
+from limbloc_ros.ros.backlog import Backlog
 from limbloc_ros.ros.body_output import BodyOutput
 from limbloc_ros.ros.cloud_messages import cloud_to_hull, surface_to_cloud
 from limbloc_ros.ros.health import Health, Meter
@@ -56,6 +57,14 @@ class PoseSettings:
     urdf_period_s: float = setting(
         5.0, "but not more often than this, so that viewers need not reload", unit="s", low=0.0, high=3600.0, live=True
     )
+    catch_up_s: float = setting(
+        2.0,
+        "hulls may wait this long, by their stamps, while a figure is searched; then only the newest is fitted",
+        unit="s",
+        low=0.0,
+        high=10.0,
+        live=True,
+    )
 
 
 class PoseNode(Node):
@@ -82,11 +91,16 @@ class PoseNode(Node):
         self.surface = self.create_publisher(PointCloud2, topics.SURFACE, topics.STREAM_QOS)
         self.body = BodyOutput(self, self.settings.body_id, self.settings.publish_tf)
         self.health = Health(self, self.describe)
-        self.create_subscription(PointCloud2, topics.HULL, self.on_hull, topics.NEWEST_QOS)
+        self.backlog: Backlog[PointCloud2] = Backlog(self, self.fit, self.settings.catch_up_s)
+        self.create_subscription(PointCloud2, topics.HULL, self.on_hull, topics.WORK_QOS)
         self.get_logger().info("ready")
 
     def on_hull(self, msg: PointCloud2) -> None:
-        """One hull: fit the figure, publish everything with the hull's stamp."""
+        """One hull: into the backlog."""
+        self.backlog.add(stamp_ns(msg.header), msg)
+
+    def fit(self, msg: PointCloud2) -> None:
+        """Fit the figure to one hull, publish everything with the hull's stamp."""
         with self.health.guard("hull"):
             stamp = stamp_ns(msg.header)
             if self.last_stamp_ns is not None and stamp < self.last_stamp_ns - JUMP_S * NANOSECONDS:
@@ -125,7 +139,13 @@ class PoseNode(Node):
 
     def describe(self) -> Sequence[DiagnosticStatus]:
         """Rate, latency, XOR energy and the time of each stage."""
-        values: dict[str, Any] = {"rate_hz": self.meter.rate_hz, "latency_ms": self.meter.latency_ms}
+        values: dict[str, Any] = {
+            "rate_hz": self.meter.rate_hz,
+            "latency_ms": self.meter.latency_ms,
+            "hulls": self.meter.count,
+            "hulls_skipped": self.backlog.skipped,
+            "hulls_waiting": len(self.backlog),
+        }
         if isinstance(self.outcome, NoPerson):
             level, message = OK, f"no person: {self.outcome.reason}"
         else:
@@ -140,6 +160,8 @@ class PoseNode(Node):
             values["xor_energy"] = float(self.outcome.energy)
             values["reliable"] = self.outcome.reliable
             values |= {f"{stage}_ms": float(ms) for stage, ms in self.outcome.stage_ms.items()}
+        if level == OK and self.backlog.behind:
+            level, message = WARN, self.backlog.behind
         if self.meter.silence_s > SILENT_S:
             level, message = WARN, f"no hull for {self.meter.silence_s:.0f} s"
         values["tf"] = self.body.tf_state
@@ -147,6 +169,7 @@ class PoseNode(Node):
 
     def _on_settings(self, settings: PoseSettings) -> None:
         self.settings = settings
+        self.backlog.longest_s = settings.catch_up_s
 
     def _on_fit_config(self, config: FitConfig) -> None:
         self.estimator = PoseEstimator(config)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.node import Node
 from sensor_msgs.msg import CompressedImage, Image
+from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
 
 from limbloc_ros.core.background import BackgroundModel, Segmentation, warm_up
@@ -19,8 +21,9 @@ from limbloc_ros.core.errors import InputError
 from limbloc_ros.core.images import Pixels
 from limbloc_ros.recordings.videos import pictures_in, read_picture
 from limbloc_ros.ros import image_messages, node_main, topics
+from limbloc_ros.ros.backlog import Backlog
 from limbloc_ros.ros.health import Health, Meter
-from limbloc_ros.ros.messages import ERROR, OK, WARN, make_status, stamp_ns
+from limbloc_ros.ros.messages import ERROR, OK, WARN, make_header, make_status, stamp_ns
 from limbloc_ros.ros.parameters import NodeParameters
 
 #: Longer without an image is worth a warning.
@@ -42,6 +45,13 @@ class SegmentationSettings:
         "", "picture of the empty room, or a folder with one named like the camera; empty: the first images show it"
     )
     publish: str = setting("on_demand", "masks nobody subscribed to are left out", choices=("on_demand", "always"))
+    catch_up_s: float = setting(
+        0.5,
+        "images may wait this long, by their stamps, for a slow moment to pass; then all cameras skip the same ones",
+        unit="s",
+        low=0.0,
+        high=10.0,
+    )
 
 
 class SegmentationNode(Node):
@@ -57,6 +67,12 @@ class SegmentationNode(Node):
         warm_up()
         self.last: Segmentation | None = None
         self.meter = Meter()
+        self.segment_ms = float("nan")
+        self.backlog: Backlog[Image | CompressedImage] = Backlog(
+            self, self.segment, self.settings.catch_up_s, self.tell_others
+        )
+        self.skips = self.create_publisher(Header, topics.FRAMES_SKIPPED, topics.STREAM_QOS)
+        self.create_subscription(Header, topics.FRAMES_SKIPPED, self.on_skipped, topics.STREAM_QOS)
         camera = self.settings.camera
         self.raw_mask = self.create_publisher(Image, topics.mask(camera), topics.STREAM_QOS)
         self.png_mask = self.create_publisher(CompressedImage, topics.mask_compressed(camera), topics.STREAM_QOS)
@@ -71,7 +87,20 @@ class SegmentationNode(Node):
         self.create_service(SetBool, topics.FREEZE_BACKGROUND, self.on_freeze)
 
     def on_image(self, msg: Image | CompressedImage) -> None:
-        """One image: segment it, publish its mask with the image's stamp and frame."""
+        """One image: into the backlog."""
+        self.backlog.add(stamp_ns(msg.header), msg)
+
+    def tell_others(self, stamp: int) -> None:
+        """We skipped our images up to this stamp (ns): without them the other cameras' are worth little."""
+        self.skips.publish(make_header(stamp, self.settings.camera))
+
+    def on_skipped(self, msg: Header) -> None:
+        """Another camera (or we) skipped its images up to this stamp."""
+        self.backlog.skip_until(stamp_ns(msg))
+
+    def segment(self, msg: Image | CompressedImage) -> None:
+        """Segment one image, publish its mask with the image's stamp and frame."""
+        started = time.thread_time()
         with self.health.guard(f"camera {self.settings.camera}"):
             self.last = self.model.segment(image_messages.message_to_pixels(msg))
             always = self.settings.publish == "always"
@@ -80,6 +109,7 @@ class SegmentationNode(Node):
             if always or self.png_mask.get_subscription_count():
                 self.png_mask.publish(image_messages.mask_to_compressed(self.last.mask, msg.header))
             self.meter.tick(self.health.latency_s(stamp_ns(msg.header)))
+            self.segment_ms = 1e3 * (time.thread_time() - started)
 
     def on_recapture(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Learn the background anew from the next images."""
@@ -106,6 +136,8 @@ class SegmentationNode(Node):
             elif self.last.learning:
                 progress = f"{self.last.frames_learned} of {wanted} images"
                 level, message = WARN, f"learning the background ({progress}): keep the room empty"
+        if level == OK and self.backlog.behind:
+            level, message = WARN, self.backlog.behind
         if self.meter.silence_s > SILENT_S:
             publishers = self.count_publishers(self.topic)
             why = "nobody publishes it" if publishers == 0 else f"{publishers} publisher(s), but no usable image came"
@@ -113,6 +145,9 @@ class SegmentationNode(Node):
         values = {
             "rate_hz": self.meter.rate_hz,
             "latency_ms": self.meter.latency_ms,
+            "segment_ms": self.segment_ms,
+            "images_segmented": self.meter.count,
+            "images_skipped": self.backlog.skipped,
             "mask_fill_percent": fill,
             "learning": self.model.learning,
             "frozen": self.model.frozen,

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+import cv2
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.node import Node
 
@@ -12,6 +13,7 @@ from limbloc_ros.core.errors import NoPerson
 from limbloc_ros.core.hull import Hull
 from limbloc_ros.core.images import Pixels
 from limbloc_ros.core.synchroniser import FrameSet, StampSynchroniser, SyncCounters
+from limbloc_ros.ros.backlog import Backlog
 from limbloc_ros.ros.health import Meter
 from limbloc_ros.ros.messages import ERROR, OK, WARN, make_status
 
@@ -25,9 +27,6 @@ class CarvingReport:
     Args:
         node: named in every entry; asked for what topics exist.
         topics: mask topic by camera.
-
-    Attributes:
-        skipped: finished sets that were not carved because newer ones had come.
     """
 
     def __init__(self, node: Node, topics: Mapping[str, str]) -> None:
@@ -36,7 +35,6 @@ class CarvingReport:
         self._masks = {camera: Meter() for camera in topics}
         self._fill = dict.fromkeys(topics, float("nan"))
         self._sets = Meter()
-        self.skipped = 0
         self._last: FrameSet[Pixels] | None = None
         self._outcome: Hull | NoPerson | None = None
         self._carve_ms = float("nan")
@@ -44,7 +42,7 @@ class CarvingReport:
     def mask(self, camera: str, mask: Pixels, latency_s: float) -> None:
         """A usable mask came."""
         self._masks[camera].tick(latency_s)
-        self._fill[camera] = 100.0 * float((mask != 0).mean())
+        self._fill[camera] = 100.0 * cv2.countNonZero(mask) / mask.size
 
     def carved(self, frames: FrameSet[Pixels], outcome: Hull | NoPerson, carve_ms: float, latency_s: float) -> None:
         """A set was carved and its hull published."""
@@ -52,22 +50,30 @@ class CarvingReport:
         self._sets.tick(latency_s)
 
     def statuses(
-        self, synchroniser: StampSynchroniser[Pixels] | None, problems: Mapping[str, str]
+        self,
+        synchroniser: StampSynchroniser[Pixels] | None,
+        backlog: Backlog[FrameSet[Pixels]],
+        problems: Mapping[str, str],
     ) -> Sequence[DiagnosticStatus]:
         """One entry for the hull, and one per camera.
 
         Args:
             synchroniser: None while there is no rig.
+            backlog: finished sets that wait to be carved.
             problems: camera -> why the rig lacks it.
         """
         counters = synchroniser.counters if synchroniser else SyncCounters()
         return [
-            self._hull(synchroniser, counters, problems),
+            self._hull(synchroniser, counters, backlog, problems),
             *(self._camera(c, counters, problems) for c in self._topics),
         ]
 
     def _hull(
-        self, synchroniser: StampSynchroniser[Pixels] | None, counters: SyncCounters, problems: Mapping[str, str]
+        self,
+        synchroniser: StampSynchroniser[Pixels] | None,
+        counters: SyncCounters,
+        backlog: Backlog[FrameSet[Pixels]],
+        problems: Mapping[str, str],
     ) -> DiagnosticStatus:
         level, message, voxels = OK, "carving", 0
         used: Sequence[str] = ()
@@ -75,6 +81,8 @@ class CarvingReport:
             message = f"no person: {self._outcome.reason}"
         elif self._outcome is not None:
             voxels, used = self._outcome.inside_count, self._outcome.cameras
+        if backlog.behind:
+            level, message = WARN, backlog.behind
         if synchroniser is None:
             level, message = ERROR, f"no rig yet: {'; '.join(problems.values()) or 'waiting for CameraInfo and TF'}"
         elif self._sets.silence_s > SILENT_S:
@@ -92,8 +100,8 @@ class CarvingReport:
             "sets_complete": counters.complete,
             "sets_incomplete": counters.incomplete,
             "sets_dropped": counters.dropped,
-            "sets_skipped": self.skipped,
-            "sets_waiting": synchroniser.waiting if synchroniser else 0,
+            "sets_skipped": backlog.skipped + counters.skipped,
+            "sets_waiting": (synchroniser.waiting if synchroniser else 0) + len(backlog),
             "jumps_back_in_time": counters.resets,
         }
         return make_status(f"{self._node.get_name()}: hull", level, message, values)

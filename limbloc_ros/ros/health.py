@@ -27,15 +27,21 @@ WINDOW_S = 5.0
 
 
 class Meter:
-    """Rate and latency of a stream over the last seconds."""
+    """Rate and latency of a stream over the last seconds.
+
+    Attributes:
+        count: messages since the start.
+    """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
         self._started = clock()
         self._ticks: deque[tuple[float, float]] = deque(maxlen=1000)
+        self.count = 0
 
     def tick(self, latency_s: float = 0.0) -> None:
         """One message came or went, `latency_s` after its acquisition."""
+        self.count += 1
         self._ticks.append((self._clock(), latency_s))
 
     def _recent(self) -> list[tuple[float, float]]:

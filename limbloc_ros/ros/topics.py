@@ -9,8 +9,8 @@ Each carved set gives exactly one message on `hull` (an empty cloud when nobody 
 
 Images are subscribed best effort, which every camera driver offers; everything we publish is reliable, because a
 reliable publisher also serves best-effort subscribers, RViz asks for reliable, and best-effort messages of some 100 KB
-are lost by an untuned Fast DDS (docs/deployment.md). All queues are short and keep the newest: under load old data is
-dropped instead of growing late.
+are lost by an untuned Fast DDS (docs/deployment.md). The queues hold what comes during a slow moment of the node behind
+them; who stays behind skips whole frames and says so (`backlog`), so that nothing grows late without end.
 """
 
 from __future__ import annotations
@@ -52,6 +52,7 @@ def optical_frame(camera: str) -> str:
 
 # --- results ---
 
+FRAMES_SKIPPED = "frames_skipped"  # std_msgs/Header: a camera's segmentation is behind; all skip up to this stamp
 HULL = "hull"  # sensor_msgs/PointCloud2, see cloud_messages.hull_to_cloud
 SURFACE = "surface"  # sensor_msgs/PointCloud2 with normals, curvature and geodesic distance, on demand
 JOINTS = "joints"  # geometry_msgs/PoseArray, 25 joints in the order of core.pose.JOINT_NAMES
@@ -103,7 +104,7 @@ def _reliable(depth: int) -> QoSProfile:
 
 def image_subscription(reliability: str) -> QoSProfile:
     """`best_effort` (works with every camera) or `reliable`."""
-    qos = _reliable(5)
+    qos = _reliable(10)
     if reliability == "best_effort":
         qos.reliability = ReliabilityPolicy.BEST_EFFORT
     return qos
@@ -111,10 +112,8 @@ def image_subscription(reliability: str) -> QoSProfile:
 
 #: Everything that is published per frame.
 STREAM_QOS = _reliable(5)
-#: Masks on their way into the synchroniser, which does its own queueing.
-MASK_QOS = _reliable(10)
-#: Input of the slowest stage: only the newest hull counts.
-NEWEST_QOS = _reliable(1)
+#: Masks and hulls on their way into nodes that carve and fit: deep enough for all that comes meanwhile.
+WORK_QOS = _reliable(30)
 DIAGNOSTICS_QOS = _reliable(10)
 #: Kept for late joiners (the URDF).
 LATCHED_QOS = QoSProfile(

@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Messages that wait for a node's work, where the node can see how many there are.
+
+A callback that works at once leaves the newer messages in the middleware's queue, which drops the oldest without a
+word. Here callbacks only put messages by, and the work is done when the executor has nothing newer: a slow moment is
+ridden over and caught up with, and when the node stays behind it skips what waits, counts it, and can say so.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Generic, TypeVar
+
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+
+from limbloc_ros.core.synchroniser import JUMP_S
+from limbloc_ros.ros.health import WINDOW_S
+from limbloc_ros.ros.messages import NANOSECONDS
+
+T = TypeVar("T")
+
+#: The work's timer fires as soon as the executor is free. (The events executor knows no guard conditions.)
+_AT_ONCE_S = 1e-6
+
+
+class Backlog(Generic[T]):
+    """Items in the order of their stamps, worked off one by one by the node's executor.
+
+    Args:
+        node: whose executor does the work.
+        work: gets each item.
+        longest_s: how far, in acquisition stamps, the oldest waiting item may lie behind the newest. Beyond this all
+            but the newest are skipped: what is late anyway shall not make the next frames late as well.
+        on_skip: told the newest stamp (ns) that was skipped.
+
+    Attributes:
+        skipped: items that were thrown away.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        work: Callable[[T], None],
+        longest_s: float,
+        on_skip: Callable[[int], None] | None = None,
+    ) -> None:
+        self.longest_s = longest_s
+        self.skipped = 0
+        self._skipped_s = -WINDOW_S
+        self._work = work
+        self._on_skip = on_skip
+        self._items: deque[tuple[int, T]] = deque()
+        self._skip_until_ns: int | None = None
+        self._last_ns: int | None = None
+        self._wake = node.create_timer(_AT_ONCE_S, self._on_wake, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._wake.cancel()
+
+    def __len__(self) -> int:
+        return len(self._items)
+
+    @property
+    def behind(self) -> str:
+        """For the diagnostics: that items were skipped in the last seconds; empty when not."""
+        if time.monotonic() - self._skipped_s > WINDOW_S:
+            return ""
+        return f"the machine is too slow: {self.skipped} frames skipped since the start"
+
+    def add(self, stamp_ns: int, item: T) -> None:
+        """Put an item by until the executor is free."""
+        if self._last_ns is not None and stamp_ns < self._last_ns - JUMP_S * NANOSECONDS:
+            self._skip_until_ns = None  # a jump back in time: what was skipped there says nothing of the new time
+        self._last_ns = stamp_ns
+        if self._skip_until_ns is not None and stamp_ns <= self._skip_until_ns:
+            self._count(1)
+            return
+        self._items.append((stamp_ns, item))
+        if stamp_ns - self._items[0][0] > self.longest_s * NANOSECONDS and len(self._items) > 1:
+            until = self._items[-2][0]
+            self.skip_until(until)
+            if self._on_skip is not None:
+                self._on_skip(until)
+        if len(self._items) == 1:
+            self._wake.reset()
+
+    def skip_until(self, stamp_ns: int) -> None:
+        """Throw away what waits with this stamp (ns) or an older one, and what comes with one later."""
+        self._skip_until_ns = stamp_ns
+        kept = [(stamp, item) for stamp, item in self._items if stamp > stamp_ns]
+        self._count(len(self._items) - len(kept))
+        self._items = deque(kept)
+
+    def clear(self) -> None:
+        """Forget what waits."""
+        self._items.clear()
+
+    def _count(self, skipped: int) -> None:
+        if skipped:
+            self.skipped += skipped
+            self._skipped_s = time.monotonic()
+
+    def _on_wake(self) -> None:
+        self._wake.cancel()
+        if self._items:
+            _, item = self._items.popleft()
+            self._work(item)
+        if self._items:
+            self._wake.reset()
