@@ -34,11 +34,11 @@ from typing import Any
 
 import cv2
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from limbloc_ros.core.camera import DISTORTION_COEFFICIENTS, Camera, Rig
 from limbloc_ros.core.errors import RigError
+from limbloc_ros.rig.plain_values import kind, known_keys, numbers, parse, read_text, required
 from limbloc_ros.rig.volume import derive_volume
 
 Array = NDArray[np.float64]
@@ -55,7 +55,17 @@ MODEL_ALIASES = {
 }
 
 _RIG_KEYS = ("version", "units", "volume", "cameras")
-_CAMERA_KEYS = ("name", "width", "height", "K", "distortion_model", "distortion", "T_world_camera", "ignore", "ignore_mask")
+_CAMERA_KEYS = (
+    "name",
+    "width",
+    "height",
+    "K",
+    "distortion_model",
+    "distortion",
+    "T_world_camera",
+    "ignore",
+    "ignore_mask",
+)
 
 
 def load_rig(path: str | Path) -> Rig:
@@ -66,33 +76,8 @@ def load_rig(path: str | Path) -> Rig:
             or of the wrong kind (which key, what was expected, what came).
     """
     path = Path(path)
-    if path.is_dir():
-        raise RigError(f"rig file {path}: expected a file, this is a folder; name the .yaml or calib.json in it")
-    try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise RigError(f"rig file {path} does not exist; give the path of a rig YAML or a calib.json") from None
-    except UnicodeDecodeError as error:
-        raise RigError(f"rig file {path}: expected UTF-8 text, got other bytes at position {error.start}") from None
-    except OSError as error:
-        raise RigError(f"rig file {path} cannot be read: {error.strerror}") from None
-    return rig_from_mapping(_parse(text, path), str(path), path.parent)
-
-
-def _parse(text: str, path: Path) -> Any:
-    """Text -> plain values; YAML, or JSON by its file name (YAML refuses tabs, JSON reads faster)."""
-    if path.suffix.lower() == ".json":
-        try:
-            return json.loads(text)
-        except json.JSONDecodeError as error:
-            raise RigError(f"rig file {path}, line {error.lineno}: not valid JSON: {error.msg}") from None
-    try:
-        return yaml.safe_load(text)
-    except yaml.MarkedYAMLError as error:
-        line = f", line {error.problem_mark.line + 1}" if error.problem_mark else ""
-        raise RigError(f"rig file {path}{line}: not valid YAML: {error.problem or error.context}") from None
-    except yaml.YAMLError as error:
-        raise RigError(f"rig file {path}: not valid YAML: {error}") from None
+    text = read_text(path, "rig file", "the .yaml or calib.json in it")
+    return rig_from_mapping(parse(text, path, "rig file"), str(path), path.parent)
 
 
 def rig_from_mapping(data: Any, source: str = "rig", folder: Path | None = None) -> Rig:
@@ -107,20 +92,20 @@ def rig_from_mapping(data: Any, source: str = "rig", folder: Path | None = None)
         RigError: which key, what was expected, what came.
     """
     if not isinstance(data, Mapping):
-        raise RigError(f"{source}: expected keys {', '.join(_RIG_KEYS)}, got {_kind(data)}")
+        raise RigError(f"{source}: expected keys {', '.join(_RIG_KEYS)}, got {kind(data)}")
     entries = data.get("cameras")
     if not isinstance(entries, Sequence) or isinstance(entries, str) or not entries:
-        raise RigError(f"{source}: key cameras: expected a list of at least one camera, got {_kind(entries)}")
+        raise RigError(f"{source}: key cameras: expected a list of at least one camera, got {kind(entries)}")
     where = [f"{source}: cameras[{i}]" for i in range(len(entries))]
     for entry, at in zip(entries, where, strict=True):
         if not isinstance(entry, Mapping):
-            raise RigError(f"{at}: expected a camera with name, width, height, K, T_world_camera, got {_kind(entry)}")
+            raise RigError(f"{at}: expected a camera with name, width, height, K, T_world_camera, got {kind(entry)}")
     benchmark = all("R" in entry and "t" in entry and "T_world_camera" not in entry for entry in entries)
     if not benchmark:
-        _known_keys(data, _RIG_KEYS, source)
+        known_keys(data, _RIG_KEYS, source)
         version = data.get("version")
         if version != VERSION or isinstance(version, bool):
-            raise RigError(f"{source}: key version: expected {VERSION}, got {_kind(version)}")
+            raise RigError(f"{source}: key version: expected {VERSION}, got {kind(version)}")
         if data.get("units", "m") != "m":
             raise RigError(
                 f"{source}: key units: expected m (metres), got {data['units']!r}; convert the file to metres"
@@ -174,12 +159,12 @@ def save_rig(rig: Rig, path: str | Path) -> None:
 def _our_camera(entry: Mapping[str, Any], at: str, folder: Path) -> Camera:
     name = _name(entry, at)
     at = f"{at} ({name})"
-    _known_keys(entry, _CAMERA_KEYS, at)
-    coefficients = _numbers(entry.get("distortion", []), None, f"{at}: key distortion")
+    known_keys(entry, _CAMERA_KEYS, at)
+    coefficients = numbers(entry.get("distortion", []), None, f"{at}: key distortion")
     model = entry.get("distortion_model", "radtan" if coefficients.size else "none")
     if not isinstance(model, str) or MODEL_ALIASES.get(model, model) not in DISTORTION_COEFFICIENTS:
         names = ", ".join([*DISTORTION_COEFFICIENTS, *(alias for alias in MODEL_ALIASES if alias)])
-        raise RigError(f"{at}: key distortion_model: expected one of {names}, got {_kind(model)}")
+        raise RigError(f"{at}: key distortion_model: expected one of {names}, got {kind(model)}")
     width, height = _pixels(entry, "width", at), _pixels(entry, "height", at)
     ignore = _polygons(entry.get("ignore", []), f"{at}: key ignore")
     if "ignore_mask" in entry:
@@ -189,7 +174,7 @@ def _our_camera(entry: Mapping[str, Any], at: str, folder: Path) -> Camera:
         width,
         height,
         _intrinsics(entry, at),
-        _camera_pose(_required(entry, "T_world_camera", at), at),
+        _camera_pose(required(entry, "T_world_camera", at), at),
         coefficients,
         MODEL_ALIASES.get(model, model),
         tuple(ignore),
@@ -199,8 +184,8 @@ def _our_camera(entry: Mapping[str, Any], at: str, folder: Path) -> Camera:
 def _polygons(value: Any, at: str) -> list[Array]:
     """Polygons of pixels, [N, 2] each."""
     if not isinstance(value, Sequence) or isinstance(value, str):
-        raise RigError(f"{at}: expected a list of polygons [[x, y], [x, y], [x, y], ...], got {_kind(value)}")
-    polygons = [_numbers(polygon, None, f"{at}[{i}]", pairs=True) for i, polygon in enumerate(value)]
+        raise RigError(f"{at}: expected a list of polygons [[x, y], [x, y], [x, y], ...], got {kind(value)}")
+    polygons = [numbers(polygon, None, f"{at}[{i}]", pairs=True) for i, polygon in enumerate(value)]
     for i, polygon in enumerate(polygons):
         if len(polygon) < 3:
             raise RigError(f"{at}[{i}]: expected three or more points [x, y] in px, got {polygon.tolist()}")
@@ -210,11 +195,13 @@ def _polygons(value: Any, at: str) -> list[Array]:
 def _mask_polygons(value: Any, folder: Path, size: tuple[int, int], at: str) -> list[Array]:
     """The outlines of what is not black in a picture: filled, they give the same pixels again."""
     if not isinstance(value, str) or not value:
-        raise RigError(f"{at}: expected the path of a picture, got {_kind(value)}")
+        raise RigError(f"{at}: expected the path of a picture, got {kind(value)}")
     path = folder / value
     picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if path.is_file() else None
     if picture is None:
-        raise RigError(f"{at}: {path} is missing or no picture; expected a PNG, white where the camera is to be ignored")
+        raise RigError(
+            f"{at}: {path} is missing or no picture; expected a PNG, white where the camera is to be ignored"
+        )
     if picture.shape != size[::-1]:
         raise RigError(
             f"{at}: {path}: expected {size[0]}x{size[1]} px like the camera's images, got "
@@ -228,9 +215,9 @@ def _mask_polygons(value: Any, folder: Path, size: tuple[int, int], at: str) -> 
 def _benchmark_camera(entry: Mapping[str, Any], at: str) -> Camera:
     name = _name(entry, at)
     at = f"{at} ({name})"
-    R = _numbers(entry["R"], (3, 3), f"{at}: key R")
-    t = _numbers(entry["t"], (3,), f"{at}: key t")
-    dist = _numbers(entry.get("dist", []), None, f"{at}: key dist")
+    R = numbers(entry["R"], (3, 3), f"{at}: key R")
+    t = numbers(entry["t"], (3,), f"{at}: key t")
+    dist = numbers(entry.get("dist", []), None, f"{at}: key dist")
     T = np.eye(4)
     T[:3, :3] = R.T
     T[:3, 3] = -R.T @ t
@@ -247,22 +234,22 @@ def _benchmark_camera(entry: Mapping[str, Any], at: str) -> Camera:
 
 
 def _name(entry: Mapping[str, Any], at: str) -> str:
-    name = _required(entry, "name", at)
+    name = required(entry, "name", at)
     if not isinstance(name, str) or not name:
-        raise RigError(f"{at}: key name: expected text such as cam0, got {_kind(name)}")
+        raise RigError(f"{at}: key name: expected text such as cam0, got {kind(name)}")
     return name
 
 
 def _pixels(entry: Mapping[str, Any], key: str, at: str) -> int:
-    value = _required(entry, key, at)
+    value = required(entry, key, at)
     if isinstance(value, bool) or not isinstance(value, int):
-        raise RigError(f"{at}: key {key}: expected a whole number of pixels, got {_kind(value)}")
+        raise RigError(f"{at}: key {key}: expected a whole number of pixels, got {kind(value)}")
     return value
 
 
 def _intrinsics(entry: Mapping[str, Any], at: str) -> Array:
     """K as three rows, or as ROS writes it: nine numbers in a row."""
-    K = _numbers(_required(entry, "K", at), (3, 3), f"{at}: key K")
+    K = numbers(required(entry, "K", at), (3, 3), f"{at}: key K")
     if K[2].tolist() != [0.0, 0.0, 1.0] and K.any():  # an all-zero K gets the message of Camera, which explains it
         raise RigError(f"{at}: key K: expected the last row 0 0 1, got {K[2].tolist()}")
     return K
@@ -272,12 +259,12 @@ def _camera_pose(value: Any, at: str) -> Array:
     """T_world_camera from a 4x4 matrix (nested or flat) or from translation and quaternion."""
     at = f"{at}: key T_world_camera"
     if not isinstance(value, Mapping):
-        T = _numbers(value, (4, 4), at)
+        T = numbers(value, (4, 4), at)
         if np.abs(T[3] - [0.0, 0.0, 0.0, 1.0]).max() > 1e-9:
             raise RigError(f"{at}: expected the last row 0 0 0 1, got {T[3].tolist()}; is the matrix transposed?")
         return T
-    _known_keys(value, ("translation", "quaternion"), at)
-    quaternion = _numbers(_required(value, "quaternion", at), (4,), f"{at}.quaternion")
+    known_keys(value, ("translation", "quaternion"), at)
+    quaternion = numbers(required(value, "quaternion", at), (4,), f"{at}.quaternion")
     length = float(np.linalg.norm(quaternion))
     if abs(length - 1.0) > 1e-3:
         raise RigError(
@@ -290,58 +277,17 @@ def _camera_pose(value: Any, at: str) -> Array:
         [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
         [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
     ]
-    T[:3, 3] = _numbers(_required(value, "translation", at), (3,), f"{at}.translation")
+    T[:3, 3] = numbers(required(value, "translation", at), (3,), f"{at}.translation")
     return T
 
 
 def _volume(value: Any, source: str) -> tuple[Array, Array]:
     at = f"{source}: key volume"
     if not isinstance(value, Mapping):
-        raise RigError(f"{at}: expected min and max corners, got {_kind(value)}")
-    _known_keys(value, ("min", "max"), at)
-    low, high = (_numbers(_required(value, key, at), (3,), f"{at}.{key}") for key in ("min", "max"))
+        raise RigError(f"{at}: expected min and max corners, got {kind(value)}")
+    known_keys(value, ("min", "max"), at)
+    low, high = (numbers(required(value, key, at), (3,), f"{at}.{key}") for key in ("min", "max"))
     return low, high
-
-
-def _required(entry: Mapping[str, Any], key: str, at: str) -> Any:
-    if key not in entry:
-        raise RigError(f"{at}: key {key} is missing; it has {', '.join(map(str, entry)) or 'no keys'}")
-    return entry[key]
-
-
-def _known_keys(entry: Mapping[str, Any], known: Sequence[str], at: str) -> None:
-    for key in entry:
-        if key not in known:
-            raise RigError(f"{at}: unknown key {key!r}; expected {', '.join(known)}")
-
-
-def _numbers(value: Any, shape: tuple[int, ...] | None, at: str, pairs: bool = False) -> Array:
-    """Plain values -> array of `shape` (a flat list of the right length will do; None: any flat list, or pairs)."""
-    expected = "a list of numbers" if shape is None else f"{'x'.join(map(str, shape))} numbers"
-    try:
-        array = (
-            np.array(value, dtype=np.float64) if isinstance(value, Sequence) and not isinstance(value, str) else None
-        )
-    except (TypeError, ValueError):  # text or nothing among the numbers, or rows of different lengths
-        array = None
-    if array is None:
-        raise RigError(f"{at}: expected {expected}, got {_kind(value)}")
-    if shape is None:
-        expected = "pairs of numbers" if pairs else expected
-        shape = (array.size // 2, 2) if pairs else (array.size,)
-    if array.shape != shape and array.shape != (int(np.prod(shape)),):
-        raise RigError(f"{at}: expected {expected}, got {'x'.join(map(str, array.shape))}")
-    if not np.isfinite(array).all():
-        raise RigError(f"{at}: expected finite numbers, got {array.tolist()}")
-    return array.reshape(shape)
-
-
-def _kind(value: Any) -> str:
-    """A value in a few words, for messages."""
-    if value is None:
-        return "nothing"
-    text = repr(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."
 
 
 def _row(values: Array) -> str:
