@@ -17,6 +17,7 @@ from limbloc_ros.core.errors import Interrupted, LimblocError
 COMMANDS = {
     "demo": "see it work: a simulated person, 8 cameras, the whole graph over real DDS",
     "run": "start the smart space on your cameras",
+    "rig": "import, calibrate, check and plan the cameras of a room",
     "process": "work out the poses of a recording: a bag, videos, image folders or a benchmark case",
     "replay": "play a bag into the running graph",
     "record": "record the running graph into a bag",
