@@ -114,7 +114,7 @@ def test_plots_break_at_gaps_and_mark_the_jump():
     np.testing.assert_allclose(crosses.get_xdata(), [0.4])
     angles = plots.joint_angles(data)
     titles = {axes.get_title() for axes in angles.axes if axes.get_visible()}
-    assert titles == {"knee flexion", "neck twist"}
+    assert titles == {"knee flexion  (-10 to 165)", "neck twist"}
     knee = next(axes for axes in angles.axes if axes.get_title() == "knee flexion")
     np.testing.assert_allclose(knee.get_lines()[0].get_ydata()[0], np.degrees(0.5))
 
@@ -202,7 +202,8 @@ def test_report_holds_every_picture_and_needs_nothing_else(tmp_path, monkeypatch
     assert embedded == set(files.values())
     assert set(files) == {
         "stick_figure", "flesh_figure", "geodesic_distance", "curvature", "normals", "anchor_points", "overlay",
-        "head_path", "joint_angles", "energy", "bone_lengths", "stage_times",
+        "head_path", "trajectories", "joint_angles", "energy", "bone_lengths", "stage_times", "error", "limb_angles",
+        "bland_altman",
     }  # fmt: skip
     for name, data_bytes in files.items():
         decoded = cv2.imdecode(np.frombuffer(data_bytes, np.uint8), cv2.IMREAD_COLOR)

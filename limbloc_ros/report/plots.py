@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 from numpy.typing import NDArray
 
+from limbloc_ros.core.joint_angles import NATIVE_ANGLES
 from limbloc_ros.core.pose import JOINT, Array
 from limbloc_ros.report.run import JUMP_M, JUMP_RAD, LIMB_JOINTS, RunData, jumps
 
@@ -44,6 +45,8 @@ STYLE: dict[str, Any] = {
     "savefig.facecolor": "white",
 }
 DPI = 110
+#: Angle -> its usual human range, degrees; only those that cannot turn round and round.
+USUAL_DEG = {a.name: (float(np.degrees(a.low)), float(np.degrees(a.high))) for a in NATIVE_ANGLES if not a.continuous}
 #: Height that is kept free for a legend above all plots, inch.
 LEGEND_IN = 0.42
 
@@ -59,7 +62,7 @@ def head_path(run: RunData) -> Figure:
     """Fig. 10: where the head was, in 3D and over time; jumps are marked."""
     path = run.joint_path("head_centre")
     broken = jumps(path, JUMP_M) if run.consecutive else np.zeros(len(path), dtype=np.bool_)
-    time, unit = _time(run)
+    time, unit = time_axis(run)
     with rc_context(STYLE):
         figure = new_figure(11, 5.2)
         halves: Any = figure.subfigures(1, 2, width_ratios=(1.05, 1.0))
@@ -79,7 +82,7 @@ def head_path(run: RunData) -> Figure:
         space.colorbar(points, ax=axes, shrink=0.62, pad=0.12, label=unit)
         rows = side.subplots(3, 1, sharex=True)
         for row, name, colour, value in zip(rows, "xyz", (BLUE, ORANGE, GREEN), path.T, strict=True):
-            _trace(row, run, time, value, colour)
+            trace(row, run, time, value, colour)
             row.plot(time[broken], value[broken], "x", color="black", markersize=8, markeredgewidth=2)
             row.set_ylabel(f"{name} (m)")
             _at_least(row, value, 0.1)
@@ -89,12 +92,13 @@ def head_path(run: RunData) -> Figure:
 
 
 def joint_angles(run: RunData) -> Figure:
-    """All joint angles over time, the left and right of a joint together; jumps are marked."""
+    """All joint angles over time, the left and right of a joint together; jumps are marked, and where the usual human
+    range ends."""
     panels = {
         name: {side: np.degrees(value) for side, value in members.items()}
         for name, members in paired(run.angles).items()
     }
-    return _small_multiples(run, panels, "degrees", float(np.degrees(JUMP_RAD)), least_span=20.0)
+    return _small_multiples(run, panels, "degrees", float(np.degrees(JUMP_RAD)), least_span=20.0, limits=USUAL_DEG)
 
 
 def bone_lengths(run: RunData) -> Figure:
@@ -125,13 +129,13 @@ def paired(series: Mapping[str, Array]) -> dict[str, dict[str, Array]]:
 
 def energy_and_confidence(run: RunData) -> Figure:
     """XOR energy (eq. 2) and the expected joint error over time, against the true error when it is known."""
-    time, unit = _time(run)
+    time, unit = time_axis(run)
     doubtful = run.found & ~run.reliable
     error = run.error_m
     with rc_context(STYLE):
         figure = new_figure(11, 6.2)
         top, bottom = figure.subplots(2, 1, sharex=True)
-        _trace(top, run, time, run.energy, BLUE)
+        trace(top, run, time, run.energy, BLUE)
         if doubtful.any():
             top.plot(time[doubtful], run.energy[doubtful], "o", color=ORANGE, markersize=7, label="not reliable")
             top.legend(loc="upper right")
@@ -139,13 +143,15 @@ def energy_and_confidence(run: RunData) -> Figure:
         top.set_ylim(0, max(0.3, 1.15 * _largest(run.energy)))
         top.set_title("energy: 0 is a perfect overlap of figure and hull")
         limbs = [JOINT[name] for name in LIMB_JOINTS]
-        _trace(
-            bottom, run, time, 100 * _over(np.nanmedian, run.sigma[:, limbs]), BLUE, "expected (sigma), median joint"
-        )
-        _trace(bottom, run, time, 100 * _over(np.nanmax, run.sigma[:, limbs]), BLUE, "expected, worst joint", ":")
+        trace(bottom, run, time, 100 * over(np.nanmedian, run.sigma[:, limbs]), BLUE, "expected (sigma), median joint")
+        trace(bottom, run, time, 100 * over(np.nanmax, run.sigma[:, limbs]), BLUE, "expected, worst joint", ":")
         if error is not None:
-            _trace(bottom, run, time, 100 * _over(np.nanmedian, error[:, limbs]), ORANGE, "true, median joint")
-            _trace(bottom, run, time, 100 * _over(np.nanmax, error[:, limbs]), ORANGE, "true, worst joint", ":")
+            trace(
+                bottom, run, time, 100 * over(np.nanmedian, error[:, limbs]), ORANGE, f"{run.truth_kind}, median joint"
+            )
+            trace(
+                bottom, run, time, 100 * over(np.nanmax, error[:, limbs]), ORANGE, f"{run.truth_kind}, worst joint", ":"
+            )
         bottom.axhline(5, color=INK, linewidth=1)
         bottom.annotate(
             "5 cm", (1, 5), xytext=(4, 0), xycoords=("axes fraction", "data"), textcoords="offset points", va="center"
@@ -196,9 +202,10 @@ def _small_multiples(
     least_span: float,
     spread: bool = False,
     columns: int = 3,
+    limits: Mapping[str, tuple[float, float]] | None = None,
 ) -> Figure:
     """One small plot per quantity, left and right in their colours."""
-    time, time_unit = _time(run)
+    time, time_unit = time_axis(run)
     rows = max(1, -(-len(panels) // columns))
     with rc_context(STYLE):
         height = LEGEND_IN + 0.3 + 2.05 * rows
@@ -210,7 +217,7 @@ def _small_multiples(
         for axes, (name, sides) in zip(grid.ravel(), panels.items(), strict=False):
             for side, value in sides.items():
                 colour, style, text = SIDES[side]
-                shown.setdefault(text, _trace(axes, run, time, value, colour, style=style))
+                shown.setdefault(text, trace(axes, run, time, value, colour, style=style))
                 broken = jumps(value, jump) if run.consecutive else np.zeros(len(value), dtype=np.bool_)
                 if broken.any():
                     marks = axes.plot(
@@ -224,12 +231,18 @@ def _small_multiples(
             axes.set_title(title, fontsize=11.5)
             axes.tick_params(labelsize=10, labelbottom=True)
             _at_least(axes, np.concatenate(list(sides.values())), least_span)
+            if limits and (full := sided(name, next(iter(sides)))) in limits:
+                low, high = limits[full]
+                axes.set_title(f"{title}  ({low:.0f} to {high:.0f})", fontsize=11.5)
+                band = _shade_outside(axes, low, high)
+                if band is not None:
+                    shown.setdefault("beyond the usual range", band)
         for axes in grid[:, 0]:
             axes.set_ylabel(unit)
         for column in range(min(columns, len(panels))):
             last = (len(panels) - 1 - column) // columns
             grid[last, column].set_xlabel(time_unit)
-        order = [text for text in ("left", "right", "middle", "jump") if text in shown]
+        order = [t for t in ("left", "right", "middle", "jump", "beyond the usual range") if t in shown]
         if order:
             handles = [shown[text] for text in order]
             engine: Any = figure.get_layout_engine()
@@ -238,12 +251,33 @@ def _small_multiples(
     return figure
 
 
-def _time(run: RunData) -> tuple[Array, str]:
+def sided(name: str, side: str) -> str:
+    """The angle's own name from its name in `paired`: `knee_flexion`, L -> `knee_L_flexion`."""
+    joint, _, what = name.partition("_")
+    return f"{joint}_{side}_{what}" if side else name
+
+
+def _shade_outside(axes: Any, low: float, high: float) -> Any:
+    """Shade beyond the usual range of an angle where that is near; the shaded area, None where there is none."""
+    bottom, top = axes.get_ylim()
+    reach = 0.35 * (top - bottom)  # so far the axis may grow to show a limit
+    floor, ceiling = min(bottom, low - 0.1 * reach), max(top, high + 0.1 * reach)
+    floor, ceiling = (floor if floor > bottom - reach else bottom), (ceiling if ceiling < top + reach else top)
+    band = None
+    for start, end, limit in ((floor, low, low), (high, ceiling, high)):
+        if start < end:
+            band = axes.axhspan(start, end, color="#F7DCD0", linewidth=0, zorder=0.5)
+            axes.axhline(limit, color="#D98C66", linewidth=1, zorder=0.6)
+    axes.set_ylim(floor, ceiling)
+    return band
+
+
+def time_axis(run: RunData) -> tuple[Array, str]:
     """The time axis: seconds, or frame numbers when the frames are unrelated."""
     return (run.seconds, "time (s)") if run.consecutive else (np.arange(len(run.joints), dtype=np.float64), "frame")
 
 
-def _trace(
+def trace(
     axes: Any, run: RunData, time: Array, value: Array, colour: str, text: str | None = None, style: str = "-"
 ) -> Any:
     """A line with gaps; points where a value stands alone between gaps or frames are unrelated; gaps shaded."""
@@ -286,7 +320,7 @@ def _at_least(axes: Any, value: Array, span: float) -> None:
         axes.set_ylim(middle - span / 2, middle + span / 2)
 
 
-def _over(reduce: Any, values: Array) -> Array:
+def over(reduce: Any, values: Array) -> Array:
     """`reduce` over the joints [F, J] -> [F]; NaN where a frame has none."""
     out = np.full(len(values), np.nan)
     some = np.isfinite(values).any(axis=1)

@@ -43,11 +43,14 @@ class RunData:
         stage_ms: stage -> [F] process time, ms.
         angles: joint angle -> [F] rad.
         missing: frame -> why it has no person.
-        truth: [F, 25, 3] true joints, m, when they are known.
+        truth: [F, 25, 3] true joints or those of a reference, m, when they are known.
         settings: what the run was made with (parameters, number of cameras), shown as they are.
         command: the command line that made it.
         version: of limbloc_ros.
         consecutive: False when the frames are unrelated poses; then no lines are drawn and no jumps sought.
+        truth_kind: `true` or `reference`, for captions.
+        truth_about: what `truth` is and how it was matched, in words.
+        truth_angles: joint angle -> [F] rad of the reference, where it has them.
     """
 
     title: str
@@ -65,6 +68,9 @@ class RunData:
     command: str = ""
     version: str = __version__
     consecutive: bool = True
+    truth_kind: str = "true"
+    truth_about: tuple[str, ...] = ()
+    truth_angles: Mapping[str, Array] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         frames = len(self.joints)
@@ -80,7 +86,7 @@ class RunData:
         values: dict[str, Any] = {name: getattr(self, name) for name in shapes}
         if self.truth is not None:
             shapes["truth"], values["truth"] = shapes["joints"], self.truth
-        for kind in ("stage_ms", "angles"):
+        for kind in ("stage_ms", "angles", "truth_angles"):
             for name, value in getattr(self, kind).items():
                 shapes[f"{kind} {name}"], values[f"{kind} {name}"] = (frames,), value
         for name, shape in shapes.items():

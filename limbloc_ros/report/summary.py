@@ -3,10 +3,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from limbloc_ros.core.pose import JOINT, Array
-from limbloc_ros.report.run import LIMB_JOINTS, RunData, joint_jumps
+from limbloc_ros.report.compare import agreement
+from limbloc_ros.report.run import LIMB_JOINTS, RunData, joint_jumps, steps
 
 Rows = list[tuple[str, str]]
 
@@ -32,9 +35,9 @@ def summary(run: RunData) -> Rows:
     if error is not None:
         limbs = error[:, [JOINT[name] for name in LIMB_JOINTS]]
         known = limbs[np.isfinite(limbs)]
-        rows.append(
-            (f"true error, {len(LIMB_JOINTS)} joints", f"mean {_mean(limbs)}, {_median_p95(limbs, 1000.0, ' mm', 1)}")
-        )
+        what = "true error" if run.truth_kind == "true" else "distance from the reference"
+        number = f"mean {_mean(limbs)}, {_median_p95(limbs, 1000.0, ' mm', 1)}"
+        rows.append((f"{what}, {len(LIMB_JOINTS)} joints", number))
         if len(known):
             rows.append(("within 5 cm", _percent(int((known < CLAIM_M).sum()), len(known)) + " of the joints found"))
             inside = limbs / run.sigma[:, [JOINT[name] for name in LIMB_JOINTS]]
@@ -44,7 +47,7 @@ def summary(run: RunData) -> Rows:
 
 
 def error_table(run: RunData) -> list[list[str]]:
-    """Joint, mean, median, 95th percentile (mm) and the share within 5 cm, of every joint whose truth is known."""
+    """Joint, mean, median, RMS, 95th percentile (mm) and the share within 5 cm, of every joint that the truth has."""
     error = run.error_m
     if error is None:
         return []
@@ -52,9 +55,39 @@ def error_table(run: RunData) -> list[list[str]]:
     for name, index in JOINT.items():
         known = error[np.isfinite(error[:, index]), index]
         if len(known):
-            numbers = (known.mean(), np.median(known), np.percentile(known, 95))
+            rms = np.sqrt((known**2).mean())
+            numbers = (known.mean(), np.median(known), rms, np.percentile(known, 95))
             share = _percent(int((known < CLAIM_M).sum()), len(known))
             table.append([name.replace("_", " "), *(f"{1000 * v:.1f}" for v in numbers), share])
+    return table
+
+
+def agreement_table(ours: Mapping[str, Array], theirs: Mapping[str, Array]) -> list[list[str]]:
+    """Angle, pairs, bias, 95 % limits of agreement, mean absolute and RMS difference in degrees, correlation."""
+    table = []
+    for name in ours:
+        found = agreement(np.degrees(ours[name]), np.degrees(theirs[name])) if name in theirs else None
+        if found is not None:
+            low, high = found.limits
+            numbers = (f"{found.bias:+.1f}", f"{low:+.1f} to {high:+.1f}", f"{found.mae:.1f}", f"{found.rmsd:.1f}")
+            r = "-" if np.isnan(found.r) else f"{found.r:.2f}"
+            table.append([name.replace("_", " "), str(found.count), *numbers, r])
+    return table
+
+
+def jump_table(run: RunData, most: int = 40) -> list[list[str]]:
+    """Frame, time and which joints jump how far (cm), frame by frame; the last row counts what is left out."""
+    broken = joint_jumps(run)
+    moved = {name: steps(run.joint_path(name)) for name in broken}
+    frames = np.flatnonzero(np.any(list(broken.values()), axis=0)) if broken else np.zeros(0, dtype=np.int64)
+    table = []
+    for frame in frames[:most]:
+        which = sorted((name for name in broken if broken[name][frame]), key=lambda name: -moved[name][frame])
+        told = [f"{name.replace('_', ' ')} {100 * moved[name][frame]:.0f} cm" for name in which]
+        more = f" and {len(told) - 4} more" if len(told) > 4 else ""
+        table.append([str(frame), f"{run.seconds[frame]:.2f} s", ", ".join(told[:4]) + more])
+    if len(frames) > most:
+        table.append([f"{len(frames) - most} more", "", ""])
     return table
 
 
