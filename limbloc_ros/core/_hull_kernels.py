@@ -243,6 +243,7 @@ def evaluate_blocks(
     seen = np.empty((3, per))
     state = np.empty((5, per))
     step = np.empty((per, 3), np.int64)
+    order = np.empty(len(cams), np.int64)
     for m in range(per):
         step[m, 0] = m // (size * size)
         step[m, 1] = m // size % size
@@ -260,7 +261,13 @@ def evaluate_blocks(
         state[3] = 0.0
         # The cameras that see the block furthest outside most likely deny its voxels: ask them first.
         wanted = per
-        for c in np.argsort(-outward[0]):
+        for c in range(len(cams)):
+            at = c
+            while at > 0 and outward[0, order[at - 1]] < outward[0, c]:
+                order[at] = order[at - 1]
+                at -= 1
+            order[at] = c
+        for c in order:
             project_block(cams, c, points, seen)
             if outward[1, c] > 0.0:
                 read_block(field, boxes, c, seen, state)
