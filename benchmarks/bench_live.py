@@ -92,6 +92,12 @@ def cpu_s(pid: int) -> float:
     return (int(fields[11]) + int(fields[12])) / TICKS
 
 
+def machine_cpu_s() -> float:
+    """What all processes of the machine have used since it started, s."""
+    fields = [int(field) for field in Path("/proc/stat").read_text().split("\n")[0].split()[1:]]
+    return (sum(fields[:8]) - fields[3] - fields[4]) / TICKS  # all but idle and waiting for a disk
+
+
 def memory_mb(pid: int) -> tuple[float, float]:
     """Proportional and resident set size, MB."""
     lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
@@ -132,15 +138,19 @@ def main() -> int:
                     return 1
                 watcher.spin()
             begin_s, begin_ns, begin_cpu = time.monotonic(), time.time_ns(), {p: cpu_s(p) for p in graph.pids.values()}
+            begin_all, begin_me = machine_cpu_s(), time.process_time()
             while time.monotonic() - begin_s < args.seconds:
                 graph.poll()
                 watcher.spin()
             seconds, end_ns = time.monotonic() - begin_s, time.time_ns()
+            others = machine_cpu_s() - begin_all - (time.process_time() - begin_me)
             used = {name: (cpu_s(p) - begin_cpu.get(p, 0.0), *memory_mb(p)) for name, p in graph.pids.items()}
             settled = time.monotonic() + 2.0
             while time.monotonic() < settled:
                 watcher.spin()
         report(watcher, used, seconds, begin_ns, end_ns, args)
+        others -= sum(cpu for cpu, _, _ in used.values())
+        print(f"the rest of the machine meanwhile: {100 * others / seconds:.0f} % of a core, of {os.cpu_count()} cores")
         print(
             f"start, warm: {watcher.first_answer_s - started:.1f} s to the first frame's answer, "  # type: ignore[operator]
             f"{watcher.first_pose_s - started:.1f} s to the first pose (the room is empty for 2 s of it)"

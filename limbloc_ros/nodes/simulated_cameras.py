@@ -34,7 +34,11 @@ from limbloc_ros.ros.messages import (
 )
 from limbloc_ros.ros.parameters import NodeParameters
 from limbloc_ros.ros.transforms import TransformOutput
+from limbloc_ros.simulation.room import Image as Image8
 from limbloc_ros.simulation.room import SimulatedRoom, default_rig
+
+#: Looks a frame: whether it is time to draw the next one, or to send it.
+TICKS = 8
 
 
 @dataclass(frozen=True)
@@ -94,6 +98,10 @@ class SimulatedCamerasNode(Node):
         self.truth = (
             self.create_publisher(PoseArray, topics.TRUE_JOINTS, topics.STREAM_QOS) if self.tells_truth else None
         )
+        # Only the stamps change; making the whole message anew costs more than sending it.
+        self.info_messages = {
+            c.name: camera_to_info(c, make_header(0, topics.optical_frame(c.name))) for c in self.cameras
+        }
         self.transforms = TransformOutput(self, static=True)
         self.transforms.send(
             [
@@ -108,47 +116,65 @@ class SimulatedCamerasNode(Node):
         if s.start_s:
             self.start_ns = round(s.start_s * NANOSECONDS) // self.period_ns * self.period_ns
         self.made_s = time.monotonic()
-        self.last_frame = -1
-        # Looks four times per frame whether the next one is due, so that frames come at their stamps' pace.
-        self.create_timer(
-            self.period_ns / 4 / NANOSECONDS, self.on_timer, clock=Clock(clock_type=ClockType.STEADY_TIME)
-        )
+        self.last_frame, self.skipped = -1, 0
+        self.rendered: tuple[int, dict[str, Image8]] = (-1, {})
+        self.tick_ns = self.period_ns // TICKS
+        self.create_timer(self.tick_ns / NANOSECONDS, self.on_timer, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def on_timer(self) -> None:
-        """Publish the newest frame that is due; under load frames are skipped, as a camera driver would."""
+        """Publish the newest frame that is due; under load frames are skipped, as a camera driver would.
+
+        Frames are drawn ahead, because real cameras need no time for it, and are sent at their stamps.
+        """
         now = self.get_clock().now().nanoseconds
         if self.start_ns is None:
             if not self._is_watched() and time.monotonic() - self.made_s < self.settings.wait_for_viewers_s:
                 return
             self.start_ns = now // self.period_ns * self.period_ns
-        frame = (now - self.start_ns) // self.period_ns
+        frame, since_ns = divmod(now - self.start_ns, self.period_ns)
+        until_ns = self.period_ns - since_ns
         if frame > self.last_frame:
-            self.last_frame = frame
             self.publish(frame)
+        elif until_ns <= self.tick_ns:
+            time.sleep(until_ns / NANOSECONDS)
+            self.publish(frame + 1)
+        elif since_ns > self.period_ns // 2 and self.rendered[0] <= frame:
+            self.render(frame + 1)
+
+    def render(self, frame: int) -> None:
+        """Draw what the watched cameras see in a frame."""
+        started, t = time.thread_time(), frame * self.period_ns / NANOSECONDS
+        watched = [c.name for c in self.cameras if _watched(self.raw.get(c.name)) or _watched(self.jpeg.get(c.name))]
+        self.rendered = frame, {name: self.room.render(name, t) for name in watched}
+        self.render_ms = 1e3 * (time.thread_time() - started)
 
     def _is_watched(self) -> bool:
         """Whether somebody subscribed to every camera."""
         return all(_watched(self.raw.get(c.name)) or _watched(self.jpeg.get(c.name)) for c in self.cameras)
 
     def publish(self, frame: int) -> None:
-        """Render and publish one instant."""
+        """Publish one instant."""
         assert self.start_ns is not None
+        if self.last_frame >= 0:
+            self.skipped += frame - self.last_frame - 1
+        self.last_frame = frame
         stamp, t = self.start_ns + frame * self.period_ns, frame * self.period_ns / NANOSECONDS
-        started = time.thread_time()
+        if self.rendered[0] != frame:
+            self.render(frame)
         for camera in self.cameras:
             header = make_header(stamp, topics.optical_frame(camera.name))
-            self.infos[camera.name].publish(camera_to_info(camera, header))
-            raw, jpeg = _watched(self.raw.get(camera.name)), _watched(self.jpeg.get(camera.name))
-            if raw is None and jpeg is None:
+            self.info_messages[camera.name].header = header
+            self.infos[camera.name].publish(self.info_messages[camera.name])
+            pixels = self.rendered[1].get(camera.name)
+            if pixels is None:
                 continue
-            pixels = self.room.render(camera.name, t)
+            raw, jpeg = _watched(self.raw.get(camera.name)), _watched(self.jpeg.get(camera.name))
             if raw is not None:
                 raw.publish(pixels_to_image(pixels, header))
             if jpeg is not None:
                 jpeg.publish(pixels_to_compressed(pixels, header, self.settings.jpeg_quality))
         if self.truth is not None:
             self.truth.publish(joints_to_message(self.room.joints(t), make_header(stamp, self.settings.world_frame)))
-        self.render_ms = 1e3 * (time.thread_time() - started)
         self.meter.tick(self.health.latency_s(stamp))
 
     def describe(self) -> Sequence[DiagnosticStatus]:
@@ -160,6 +186,8 @@ class SimulatedCamerasNode(Node):
             "rate_hz": self.meter.rate_hz,
             "latency_ms": self.meter.latency_ms,
             "render_ms": self.render_ms,
+            "frames": self.meter.count,
+            "frames_skipped": self.skipped,
             "cameras": " ".join(camera.name for camera in self.cameras),
         }
         return [make_status(f"{self.get_name()}: images", level, message, values)]

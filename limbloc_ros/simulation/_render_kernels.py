@@ -42,6 +42,22 @@ def project(points: Array, R: Array, t: Array, K: Array, k: Array, uv: Array, de
 
 
 @njit(cache=True, error_model="numpy")
+def bounds(uv: Array, depth: Array, near: float) -> tuple[bool, float, float, float, float]:
+    """Least and greatest u, v of the points deeper than `near` m; False if there is none or one is NaN."""
+    u0 = v0 = np.inf
+    u1 = v1 = -np.inf
+    for k in range(len(uv)):
+        if not depth[k] > near:
+            continue
+        u, v = uv[k, 0], uv[k, 1]
+        if math.isnan(u) or math.isnan(v):
+            return False, 0.0, 0.0, 0.0, 0.0
+        u0, u1 = min(u0, u), max(u1, u)
+        v0, v1 = min(v0, v), max(v1, v)
+    return u0 <= u1, u0, v0, u1, v1
+
+
+@njit(cache=True, error_model="numpy")
 def shade_vertices(vertices: Array, faces: Faces, light: Array, tone: Array, shade: Array) -> None:
     """Gouraud shading [V]: light from above and a lamp in the direction `light`, times each vertex' own `tone`."""
     n = len(vertices)

@@ -29,6 +29,8 @@ _HEIGHTS_M = (2.4, 1.3, 2.8, 1.7, 2.1, 1.2, 2.6, 1.9)
 _LIGHT = np.array([0.35, -0.25, 0.9]) / np.linalg.norm([0.35, -0.25, 0.9])
 _CELL_M = 0.02
 _NEAR_M = 0.15
+# Points on the rim of the unit square, densely, because the image of a straight edge is not straight.
+_RIM = np.concatenate([[(a, 0), (a, 1), (0, a), (1, a)] for a in np.linspace(0, 1, 9)])
 
 # bgr of skin, hair, shirt, trousers, shoes. In places they come close to a wall or to the shaded floor, as in life.
 _PALETTES = {
@@ -277,21 +279,17 @@ class SimulatedRoom:
     def _draw_shadow(self, view: _View, instant: _Instant, image: Image) -> None:
         h, w = instant.floor_light.shape
         x0, y0 = instant.floor_cell
-        # A dense rim, because the image of a straight edge is not straight.
-        s = np.linspace(0, 1, 9)
-        rim = np.concatenate([[(a, 0), (a, 1), (0, a), (1, a)] for a in s])
-        ground = np.zeros((len(rim), 3))
-        ground[:, :2] = (rim * [w, h] + [x0, y0]) * _CELL_M - HALF_M
-        uv, _ = view.project(ground)
-        box = _image_box(uv, view.camera)
+        ground = np.zeros((len(_RIM), 3))
+        ground[:, :2] = (_RIM * [w, h] + [x0, y0]) * _CELL_M - HALF_M
+        uv, depth = view.project(ground)
+        whole = 0, 0, view.camera.width, view.camera.height
+        box = whole if np.isnan(uv).any() else _image_box(uv, depth, -np.inf, view.camera)
         if box is not None:
             kernels.darken_floor(image, view.floor, instant.floor_light, x0, y0, *box)
 
     def _draw_person(self, view: _View, instant: _Instant, image: Image, mask: Mask) -> None:
         uv, depth = view.project(instant.person.vertices)
-        if not (depth > _NEAR_M).any():
-            return
-        box = _image_box(uv[depth > _NEAR_M], view.camera)
+        box = _image_box(uv, depth, _NEAR_M, view.camera)
         if box is None:
             return
         kernels.rasterise(
@@ -302,11 +300,11 @@ class SimulatedRoom:
         kernels.soften_edges(image, image[y0:y1, x0:x1].copy(), mask, x0, y0, x1, y1)
 
 
-def _image_box(uv: Array, camera: Camera) -> tuple[int, int, int, int] | None:
-    """x0, y0, x1, y1 around points within the image with a margin; the whole image if some lie behind the camera."""
-    if np.isnan(uv).any():
-        return 0, 0, camera.width, camera.height
-    low, high = np.floor(uv.min(0)) - 2, np.ceil(uv.max(0)) + 3
-    x0, y0 = int(max(low[0], 0)), int(max(low[1], 0))
-    x1, y1 = int(min(high[0], camera.width)), int(min(high[1], camera.height))
+def _image_box(uv: Array, depth: Array, near: float, camera: Camera) -> tuple[int, int, int, int] | None:
+    """x0, y0, x1, y1 within the image, with a margin, around the points deeper than `near` m; None if there are none."""
+    some, u0, v0, u1, v1 = kernels.bounds(uv, depth, near)
+    if not some:
+        return None
+    x0, y0 = int(max(math.floor(u0) - 2, 0)), int(max(math.floor(v0) - 2, 0))
+    x1, y1 = int(min(math.ceil(u1) + 3, camera.width)), int(min(math.ceil(v1) + 3, camera.height))
     return (x0, y0, x1, y1) if x0 < x1 and y0 < y1 else None
