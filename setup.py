@@ -7,7 +7,17 @@ from setuptools import find_packages, setup
 
 NAME = "limbloc_ros"
 SHARE = f"share/{NAME}"
-NODES = ("segmentation", "carving", "pose", "simulated_cameras", "replay", "record", "composed", "smart_space")
+NODES = (
+    "segmentation",
+    "carving",
+    "pose",
+    "simulated_cameras",
+    "replay",
+    "record",
+    "composed",
+    "smart_space",
+    "foxglove_bridge",
+)
 
 
 def files(pattern: str) -> list[str]:
@@ -54,8 +64,11 @@ setup(
             "types-PyYAML",
             "scipy-stubs",
             "ezc3d>=1.5,<2",
+            "foxglove-sdk>=0.20,<0.31",
+            "websockets>=13,<18",
         ],
         "export": ["ezc3d>=1.5,<2"],  # C3D; the other formats need nothing
+        "foxglove": ["foxglove-sdk>=0.20,<0.31"],  # a live view in a browser
         "viewer": ["open3d-cpu>=0.19,<0.21"],
     },
     zip_safe=False,

@@ -82,7 +82,7 @@ OUTSIDE = {
     "export": NUMERIC | {"ezc3d"},
     "report": NUMERIC | {"matplotlib", "mpl_toolkits", "open3d"},
     "ros": NUMERIC | ROS,
-    "nodes": NUMERIC | ROS | {"yaml"},
+    "nodes": NUMERIC | ROS | {"yaml", "foxglove"},
     "commands": NUMERIC | ROS | {"yaml", "tqdm"},
 }
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from limbloc_ros.core import config
 from limbloc_ros.nodes.carving import CarvingSettings
+from limbloc_ros.nodes.foxglove_bridge import FoxgloveSettings
 from limbloc_ros.nodes.pose import PoseSettings
 from limbloc_ros.nodes.record import RecordSettings
 from limbloc_ros.nodes.replay import ReplaySettings
@@ -44,6 +45,7 @@ SECTIONS = (
     ("replay", "", ReplaySettings),
     ("replay", "sync.", config.SyncConfig),
     ("record", "", RecordSettings),
+    ("foxglove_bridge", "", FoxgloveSettings),
     ("processes", "", ProcessConfig),
     ("network", "", NetworkConfig),
 )

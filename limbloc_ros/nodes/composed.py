@@ -41,6 +41,7 @@ KINDS = {
     "simulated_cameras": "SimulatedCamerasNode",
     "replay": "ReplayNode",
     "record": "RecordNode",
+    "foxglove_bridge": "FoxgloveBridge",
 }
 
 #: Exit code when a node refused its parameters or input: starting again would not help.

@@ -75,8 +75,8 @@ class RecordNode(Node):
         self.settings = NodeParameters(self).declare(RecordSettings)
         s = self.settings
         default = (*DEFAULT_TOPICS, *self._image_patterns())
-        self._include = _patterns("topics", s.topics or default)
-        self._exclude = _patterns("exclude", s.exclude)
+        self._include = topic_patterns("topics", s.topics or default)
+        self._exclude = topic_patterns("exclude", s.exclude)
         self.done = threading.Event()
         self.error: str | None = None
         self._subscriptions_by_topic: dict[str, Any] = {}
@@ -186,7 +186,8 @@ class RecordNode(Node):
         self.done.set()
 
 
-def _patterns(parameter: str, texts: tuple[str, ...]) -> list[re.Pattern[str]]:
+def topic_patterns(parameter: str, texts: tuple[str, ...]) -> list[re.Pattern[str]]:
+    """Regular expressions of topic names; raises ConfigError, naming the parameter, when one is none."""
     try:
         return [re.compile(text) for text in texts]
     except re.error as error:

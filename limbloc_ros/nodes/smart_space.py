@@ -16,7 +16,7 @@ from rclpy.utilities import remove_ros_args
 from limbloc_ros.core.errors import ConfigError, LimblocError
 from limbloc_ros.nodes.graph_plan import SmartSpaceConfig, load_config, plan_graph
 from limbloc_ros.ros.environment import config_file, graph_environment
-from limbloc_ros.ros.supervisor import Supervisor
+from limbloc_ros.ros.supervisor import ProcessPlan, Supervisor
 
 EXAMPLES = """examples:
   smart_space                                          eight simulated cameras, and a person who moves
@@ -35,6 +35,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--bag", metavar="BAG", help="recording to replay")
     parser.add_argument("--cameras", metavar="A,B,...", help="only these cameras of the rig")
     parser.add_argument("--record", metavar="FOLDER", help="record the run to this new folder")
+    parser.add_argument(
+        "--foxglove",
+        nargs="?",
+        type=int,
+        const=8765,
+        metavar="PORT",
+        help="also serve the graph to Foxglove on this machine (default port: 8765; needs the extra `foxglove`)",
+    )
     parser.add_argument(
         "--set",
         metavar="KEY=VALUE",
@@ -71,14 +79,21 @@ def config_from_arguments(options: argparse.Namespace) -> SmartSpaceConfig:
     return load_config(options.config or config_file("smart_space.yaml"), overrides)
 
 
-def run(config: SmartSpaceConfig) -> int:
+def run(config: SmartSpaceConfig, foxglove_port: int | None = None) -> int:
     """Plan, start, watch and stop; returns the exit code.
+
+    Args:
+        config: from `config_from_arguments`.
+        foxglove_port: where to serve the graph to Foxglove; None: not at all.
 
     Raises:
         LimblocError: the config, rig or bag cannot be used.
     """
     with tempfile.TemporaryDirectory(prefix="limbloc_") as folder:
         plans = plan_graph(config, Path(folder))
+        if foxglove_port is not None:
+            bridge = {"kind": "foxglove_bridge", "name": "foxglove_bridge", "parameters": {"port": foxglove_port}}
+            plans.append(ProcessPlan("foxglove", "", (bridge,)))
         environment = graph_environment(config.network)
         print(f"smart space: source {config.source}, {len(plans)} processes. Ctrl-C stops everything")
         for plan in plans:
@@ -95,7 +110,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     add_arguments(parser)
     options = parser.parse_args(remove_ros_args(list(sys.argv if argv is None else ["smart_space", *argv]))[1:])
     try:
-        return run(config_from_arguments(options))
+        return run(config_from_arguments(options), options.foxglove)
     except LimblocError as error:
         print(f"smart_space: {error}", file=sys.stderr)
         return 1
