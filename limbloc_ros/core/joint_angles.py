@@ -17,14 +17,16 @@ the side, not at a hanging one.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from limbloc_ros.core import _joint_angles_kernels as kernels
 from limbloc_ros.core._figure_kernels import exp_so3
-from limbloc_ros.core.figure import BONE, BONE_NAMES, N_BONES, PARENTS, proportions
+from limbloc_ros.core.errors import NoPerson
+from limbloc_ros.core.figure import BONE, BONE_NAMES, N_BONES, PARENTS, FigureState, proportions
+from limbloc_ros.core.pose import Pose
 
 Array = NDArray[np.float64]
 
@@ -33,6 +35,8 @@ Array = NDArray[np.float64]
 NATIVE_SLACK = 0.0015
 #: How far beyond its range an angle may go before another, farther triple is preferred, rad.
 _STRAY = 0.5
+#: After this long without a pose the angles start anew, s: whoever comes back may have turned round and round.
+GAP_S = 1.0
 
 
 @dataclass(frozen=True)
@@ -224,6 +228,39 @@ def native_angles(
         for angle, value in zip(angles, values, strict=True):
             result[angle.name] = float(value)
     return {angle.name: result[angle.name] for angle in NATIVE_ANGLES}
+
+
+class ContinuousAngles:
+    """Gives the poses of a sequence angles that do not jump, each the nearest to those of the frame before.
+
+    The engines leave `Pose.angles` as they are for a frame alone. The live node and the offline run both pass all
+    their frames through here in the order of their stamps, and so get the same angles.
+    """
+
+    def __init__(self) -> None:
+        self._last: Mapping[str, float] | None = None
+        self._last_ns = 0
+
+    def follow(self, outcome: Pose | NoPerson, stamp_ns: int) -> Pose | NoPerson:
+        """The same outcome, its angles continuing those of the last pose, if that was within GAP_S."""
+        if isinstance(outcome, NoPerson):
+            return outcome
+        if abs(stamp_ns - self._last_ns) > GAP_S * 1e9:
+            self._last = None
+        if self._last is not None:
+            shape = FigureState.from_vector(outcome.parameters).shape
+            outcome = replace(outcome, angles=native_angles(outcome.rotations, self._last, shape))
+        self.resume(outcome, stamp_ns)
+        return outcome
+
+    def resume(self, outcome: Pose | NoPerson, stamp_ns: int) -> None:
+        """Go on after a frame that has been followed before."""
+        if isinstance(outcome, Pose):
+            self._last, self._last_ns = outcome.angles, stamp_ns
+
+    def reset(self) -> None:
+        """Forget the last frame."""
+        self._last = None
 
 
 def native_rotations(angles: Mapping[str, float]) -> Array:

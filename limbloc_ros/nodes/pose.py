@@ -20,6 +20,7 @@ from limbloc_ros.core.config import FitConfig, setting
 from limbloc_ros.core.errors import ConfigError, NoPerson
 from limbloc_ros.core.geodesic import geodesic_map
 from limbloc_ros.core.hull import Hull
+from limbloc_ros.core.joint_angles import ContinuousAngles
 from limbloc_ros.core.pipeline import PoseEstimator
 from limbloc_ros.core.pose import Pose
 from limbloc_ros.core.surface import extract_surface
@@ -79,6 +80,7 @@ class PoseNode(Node):
             raise ConfigError(
                 f"parameter body_id: expected letters and digits, a letter first, got {self.settings.body_id!r}"
             )
+        self.angles_over_time = ContinuousAngles()
         self.outcome: Pose | NoPerson = NoPerson("no hull yet")
         self.last_stamp_ns: int | None = None
         self.meter = Meter()
@@ -105,11 +107,13 @@ class PoseNode(Node):
             stamp = stamp_ns(msg.header)
             if self.last_stamp_ns is not None and stamp < self.last_stamp_ns - JUMP_S * NANOSECONDS:
                 self.estimator.reset()
+                self.angles_over_time.reset()
                 self.body.reset()
             self.last_stamp_ns = stamp
             header = messages.make_header(stamp, self.settings.world_frame)
             hull = cloud_to_hull(msg)
-            self.outcome = NoPerson("the hull is empty") if hull is None else self.estimator.estimate(hull)
+            outcome = NoPerson("the hull is empty") if hull is None else self.estimator.estimate(hull)
+            self.outcome = self.angles_over_time.follow(outcome, stamp)
             self.publish_pose(self.outcome, header)
             if hull is not None and self.surface.get_subscription_count():
                 self.publish_surface(hull, header)

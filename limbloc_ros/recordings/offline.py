@@ -31,6 +31,7 @@ from limbloc_ros.core import background
 from limbloc_ros.core.camera import Rig
 from limbloc_ros.core.config import BackgroundConfig, FitConfig, HullConfig, SyncConfig
 from limbloc_ros.core.errors import InputError, Interrupted, NoPerson
+from limbloc_ros.core.joint_angles import ContinuousAngles
 from limbloc_ros.core.pipeline import Carver, PoseEstimator
 from limbloc_ros.recordings.cases import pack_mask, unpack_mask
 from limbloc_ros.recordings.checkpoint import Checkpoint, fingerprint
@@ -99,10 +100,17 @@ def process(
     total = None if source.frames is None else source.frames - leave_out
     jobs = 1 if config.fit.temporal else min(jobs or usable_cores(), total or 10**6)
     frames = list(done)
+    # Frames of a set that is no sequence have nothing to do with each other.
+    angles = ContinuousAngles() if source.about.get("consecutive", True) else None
+    if angles is not None:
+        for frame in done:
+            angles.resume(frame.outcome, frame.stamp_ns)
     kept = kept if kept is not None else KeptFrames()
     progress(len(frames), total)
     try:
         for frame in _fitted(source, config, jobs, _Part(leave_out, len(done)), kept):
+            if angles is not None:
+                frame = dataclasses.replace(frame, outcome=angles.follow(frame.outcome, frame.stamp_ns))
             frames.append(frame)
             checkpoint.add(frame)
             progress(len(frames), total)
