@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import tempfile
 import time
 from datetime import datetime
 from pathlib import Path
@@ -94,7 +95,8 @@ def _run_live(args: argparse.Namespace, out: Path) -> None:
         set=settings,
     )
     config = config_from_arguments(options)
-    plans = plan_graph(config, out)
+    run_folder = tempfile.TemporaryDirectory(prefix="limbloc_")
+    plans = plan_graph(config, Path(run_folder.name))
     environment = graph_environment(config.network)
     # This process takes part in the same DDS domain; the variables are read when the first node is made.
     os.environ.update(environment)
@@ -105,7 +107,7 @@ def _run_live(args: argparse.Namespace, out: Path) -> None:
     print(f"{args.cameras} cameras at {args.rate:g} Hz, {len(plans)} processes, ROS_DOMAIN_ID {domain}")
     print("the room is empty at first, while the background is learned; Ctrl-C ends the demo early\n", flush=True)
     log = (out / "graph.log").open("w", encoding="utf-8")
-    with log, LiveTable() as table:
+    with log, run_folder, LiveTable() as table:
         # The supervisor ends all children on the way out, whatever happens.
         with Supervisor(plans, environment, config.processes, lambda line: print(line, file=log, flush=True)) as graph:
             started = time.monotonic()

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -187,6 +187,52 @@ class BackgroundModel:
             self._mean[c], self._variance[c] = planes_c
         self._learned = 1
         self._ready = True
+        self._fix_model()
+
+    def state(self) -> dict[str, NDArray[Any]] | None:
+        """All that `restore` needs to go on from here; None while the background is unknown."""
+        if not self._ready:
+            return None
+        assert self._image_shape is not None
+        return {
+            "mean": self._mean,
+            "variance": self._variance,
+            "gain": self._gain,
+            "image_shape": np.array(self._image_shape),
+            "max_pixels": np.array(self._config.max_pixels),
+            "learned": np.array(self._learned),
+            "grey": np.array(self._grey),
+            "noise_known": np.array(self._noise_known),
+            "frozen": np.array(self._frozen),
+        }
+
+    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Go on from what `state` gave.
+
+        Raises:
+            InputError: it is not such a state, or of another working size (`max_pixels`).
+        """
+        try:
+            mean, variance = (np.array(state[key], dtype=np.float32) for key in ("mean", "variance"))
+            gain = np.array(state["gain"], dtype=np.float32)
+            height, width = (int(n) for n in state["image_shape"])
+            flags = [bool(state[key]) for key in ("grey", "noise_known", "frozen")]
+            learned, max_pixels = int(state["learned"]), int(state["max_pixels"])
+        except (KeyError, TypeError, ValueError) as error:
+            raise InputError(f"expected a saved background, got something else ({error})") from None
+        fits = mean.ndim == 3 and mean.shape[0] == 3 and variance.shape == mean.shape and gain.shape == (3,)
+        if not fits or max_pixels != self._config.max_pixels:
+            raise InputError(
+                f"expected a saved background of at most {self._config.max_pixels} px, got one made with max_pixels "
+                f"{max_pixels} and arrays of {mean.shape} and {variance.shape}"
+            )
+        if not (np.isfinite(mean).all() and np.isfinite(variance).all() and np.isfinite(gain).all()):
+            raise InputError("expected a saved background of finite numbers")
+        self._forget()
+        self._mean, self._variance, self._gain, self._image_shape = mean, variance, gain, (height, width)
+        self._grey, self._noise_known, self._frozen = flags
+        self._busy = np.zeros(mean.shape[1:], dtype=np.uint8)
+        self._learned, self._ready = learned, True
         self._fix_model()
 
     def segment(self, image: Bytes) -> Segmentation:

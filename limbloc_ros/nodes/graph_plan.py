@@ -105,29 +105,31 @@ def plan_graph(config: SmartSpaceConfig, run_folder: Path) -> list[ProcessPlan]:
 
     Args:
         config: a valid config.
-        run_folder: where a rig file for the simulated cameras is written.
+        run_folder: for files that live as long as the run: the rig of the simulated cameras, and the cameras'
+            backgrounds, which a segmentation process that is started again finds there.
 
     Raises:
         ConfigError: keys that contradict each other or are missing.
         RigError, InputError: the rig or the bag cannot be used.
     """
     if config.source == "simulated":
-        return _Plan(config).simulated(run_folder)
+        return _Plan(config, run_folder).simulated()
     if config.source == "cameras":
-        return _Plan(config).real_cameras()
-    return _Plan(config).replayed()
+        return _Plan(config, run_folder).real_cameras()
+    return _Plan(config, run_folder).replayed()
 
 
 class _Plan:
     """Builds the list of processes for one config."""
 
-    def __init__(self, config: SmartSpaceConfig) -> None:
+    def __init__(self, config: SmartSpaceConfig, run_folder: Path) -> None:
         self.config = config
+        self.run_folder = run_folder
         self.namespace = config.namespace
         self.sim_time = False
         self.processes: list[ProcessPlan] = []
 
-    def simulated(self, run_folder: Path) -> list[ProcessPlan]:
+    def simulated(self) -> list[ProcessPlan]:
         """Simulated cameras and the graph."""
         c = self.config
         section = dict(c.simulated_cameras)
@@ -137,7 +139,7 @@ class _Plan:
                 _number(section, key, default)
                 for key, default in (("number_of_cameras", 8), ("width", 640), ("height", 480))
             )
-            rig_file = str(run_folder / "rig.yaml")
+            rig_file = str(self.run_folder / "rig.yaml")
             save_rig(default_rig(count, width, height), rig_file)
         names = self._names(rig_file)
         section |= {"rig_file": rig_file, "transport": c.transport}
@@ -202,13 +204,18 @@ class _Plan:
             )
         # Our own publishers are reliable, and nothing may be lost; a camera driver may offer best effort only.
         reliability = "best_effort" if c.source == "cameras" else "reliable"
+        common = {
+            "reliability": reliability,
+            "state_folder": str((self.run_folder / "background").resolve()),
+            **c.segmentation,
+        }
         for i, group in enumerate(_groups(list(transports), c.processes.cameras_per_process), 1):
             nodes = [
                 _node(
                     "segmentation",
                     f"segmentation_{name}",
                     _merged(
-                        {"reliability": reliability, **c.segmentation, "camera": name, "transport": transports[name]},
+                        {**common, "camera": name, "transport": transports[name]},
                         c.segmentation_of.get(name) or {},
                     ),
                 )

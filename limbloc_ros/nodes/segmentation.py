@@ -19,6 +19,7 @@ from limbloc_ros.core.background import BackgroundModel, Segmentation, warm_up
 from limbloc_ros.core.config import BackgroundConfig, setting
 from limbloc_ros.core.errors import InputError
 from limbloc_ros.core.images import Pixels
+from limbloc_ros.recordings.background_file import load_background, save_background
 from limbloc_ros.recordings.videos import pictures_in, read_picture
 from limbloc_ros.ros import image_messages, node_main, topics
 from limbloc_ros.ros.backlog import Backlog
@@ -28,6 +29,9 @@ from limbloc_ros.ros.parameters import NodeParameters
 
 #: Longer without an image is worth a warning.
 SILENT_S = 2.0
+
+#: The background follows the light; so often what is kept of it does too.
+SAVE_PERIOD_S = 60.0
 
 
 @dataclass(frozen=True)
@@ -43,6 +47,9 @@ class SegmentationSettings:
     )
     background_picture: str = setting(
         "", "picture of the empty room, or a folder with one named like the camera; empty: the first images show it"
+    )
+    state_folder: str = setting(
+        "", "the learned background is kept here and found again after a restart; empty: it is learned anew"
     )
     publish: str = setting("on_demand", "masks nobody subscribed to are left out", choices=("on_demand", "always"))
     catch_up_s: float = setting(
@@ -65,6 +72,9 @@ class SegmentationNode(Node):
         if self.settings.background_picture:
             self.model.seed(background_picture(Path(self.settings.background_picture), self.settings.camera))
         warm_up()
+        folder = self.settings.state_folder
+        self.state_file = Path(folder) / f"{self.settings.camera}.npz" if folder else None
+        self.saved_s: float | None = None
         self.last: Segmentation | None = None
         self.meter = Meter()
         self.segment_ms = float("nan")
@@ -82,6 +92,7 @@ class SegmentationNode(Node):
             self.topic, kind = topics.image(camera), Image
         else:
             self.topic, kind = topics.image_compressed(camera), CompressedImage
+        self.restore_background()
         self.create_subscription(kind, self.topic, self.on_image, qos)
         self.create_service(Trigger, topics.RECAPTURE_BACKGROUND, self.on_recapture)
         self.create_service(SetBool, topics.FREEZE_BACKGROUND, self.on_freeze)
@@ -109,11 +120,38 @@ class SegmentationNode(Node):
             if always or self.png_mask.get_subscription_count():
                 self.png_mask.publish(image_messages.mask_to_compressed(self.last.mask, msg.header))
             self.meter.tick(self.health.latency_s(stamp_ns(msg.header)))
+            self.save_background()
             self.segment_ms = 1e3 * (time.thread_time() - started)
+
+    def restore_background(self) -> None:
+        """Go on with the background of the process before, if there was one."""
+        if self.state_file is None or not self.state_file.is_file():
+            return
+        with self.health.guard("background"):
+            age_s = time.time() - self.state_file.stat().st_mtime
+            load_background(self.model, self.state_file)
+            self.saved_s = time.monotonic()
+            self.get_logger().info(f"going on with the background of {self.state_file}, {age_s:.0f} s old")
+
+    def save_background(self) -> None:
+        """Keep the background for the process after us, now and then."""
+        now = time.monotonic()
+        if self.state_file is None or self.model.learning or (self.saved_s and now - self.saved_s < SAVE_PERIOD_S):
+            return
+        self.saved_s = now
+        with self.health.guard("background"):
+            save_background(self.model, self.state_file)
+
+    def forget_background(self) -> None:
+        """What was saved is no longer to be used."""
+        self.saved_s = None
+        if self.state_file is not None:
+            self.state_file.unlink(missing_ok=True)
 
     def on_recapture(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Learn the background anew from the next images."""
         self.model.recapture()
+        self.forget_background()
         response.success = True
         response.message = f"learning the background of {self.settings.camera}: keep the room empty"
         return response

@@ -124,7 +124,7 @@ class Run:
             OutputError: the folder cannot be written to (a full disk, no permission).
         """
         folder = Path(folder)
-        _make_folder(folder)
+        make_folder(folder)
         self.save_joints(folder / "joints.npz")
         replace_file(folder / "joint_angles.csv", lambda file: file.write(self._angles_csv().encode()))
         save_frames(self.frames, folder / "run.npz")
@@ -148,7 +148,7 @@ class Run:
             "sigma": self.sigma,
             "reliable": self.reliable,
         }
-        _make_folder(Path(path).parent)
+        make_folder(Path(path).parent)
         replace_file(Path(path), lambda file: np.savez_compressed(file, **arrays))
 
     def _angles_csv(self) -> str:
@@ -269,7 +269,8 @@ def _union(groups: Any) -> tuple[str, ...]:
     return tuple(dict.fromkeys(name for group in groups for name in group))
 
 
-def _make_folder(folder: Path) -> None:
+def make_folder(folder: Path) -> None:
+    """Make an output folder; raises OutputError when that cannot be."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
