@@ -36,6 +36,7 @@ ARGUMENTS = {
     "bag": ("", "recording to replay"),
     "cameras": ("", "only these cameras of the rig, separated by commas"),
     "record": ("", "record the run to this new folder"),
+    "foxglove": ("false", "serve the graph to Foxglove too: true or false"),
     "rviz": ("false", "start RViz too: true or false"),
 }
 
@@ -61,6 +62,8 @@ def start(context):
         overrides["record_to"] = given["record"]
     if given["cameras"]:
         overrides["cameras"] = [name.strip() for name in given["cameras"].split(",") if name.strip()]
+    if given["foxglove"].lower() in ("true", "1", "yes"):
+        overrides["foxglove"] = True
     config = load_config(given["config"] or config_file("smart_space.yaml"), overrides)
     folder = tempfile.TemporaryDirectory(prefix="limbloc_")
     plans = plan_graph(config, Path(folder.name))

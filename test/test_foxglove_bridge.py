@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The Foxglove bridge over real DDS and a real websocket: what a viewer gets is what was published, byte for byte."""
 
+import argparse
 import contextlib
 import json
 import re
@@ -20,7 +21,9 @@ from websockets.sync.client import connect
 from limbloc_ros.core.errors import ConfigError
 from limbloc_ros.core.joint_angles import NATIVE_ANGLES
 from limbloc_ros.core.pose import JOINT_NAMES
+from limbloc_ros.nodes import smart_space
 from limbloc_ros.nodes.foxglove_bridge import FoxgloveBridge
+from limbloc_ros.nodes.graph_plan import plan_graph
 from limbloc_ros.recordings.bags import TYPESTORE
 from limbloc_ros.ros import topics
 
@@ -183,3 +186,19 @@ def test_rviz_shows_topics_that_there_are():
             if key in display:
                 name = display[key]["Value"].lstrip("/")
                 assert name in ours | {topics.image("cam0"), topics.mask("cam0")}, name
+
+
+def test_the_plan_has_the_bridge_when_asked_for(tmp_path):
+    parser = argparse.ArgumentParser()
+    smart_space.add_arguments(parser)
+
+    def bridges(*words):
+        plans = plan_graph(smart_space.config_from_arguments(parser.parse_args(words)), tmp_path)
+        return [dict(node) for plan in plans for node in plan.nodes if node["kind"] == "foxglove_bridge"]
+
+    assert bridges() == []
+    assert bridges("--foxglove")[0]["parameters"]["port"] == 8765
+    assert bridges("--foxglove", "9000")[0]["parameters"]["port"] == 9000
+    assert (
+        bridges("--set", "foxglove=true", "--set", "foxglove_bridge.host=0.0.0.0")[0]["parameters"]["host"] == "0.0.0.0"
+    )

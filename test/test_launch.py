@@ -5,7 +5,6 @@ The launch file starts what `plan_graph` says; test_smart_space.py runs those pl
 """
 
 import ast
-import json
 import xml.etree.ElementTree as ET
 from dataclasses import fields
 from pathlib import Path
@@ -14,7 +13,6 @@ import pytest
 import yaml
 
 import limbloc_ros
-from limbloc_ros.core.pose import JOINT
 from limbloc_ros.nodes.composed import KINDS, flatten
 from limbloc_ros.nodes.graph_plan import NODE_SECTIONS, SmartSpaceConfig
 from limbloc_ros.rig.rig_file import load_rig
@@ -103,16 +101,6 @@ def test_the_dds_profile_is_the_default_one_with_large_segments():
     assert int(shared[0].findtext("d:maxMessageSize", "0", space)) == 4 * 2**20
     participant = root.find(".//d:participant", space)
     assert participant is not None and participant.get("is_default_profile") == "true"
-
-
-def test_foxglove_shows_topics_and_joints_that_exist():
-    layout = json.loads((CONFIG / "limbloc.foxglove.json").read_text(encoding="utf-8"))["configById"]
-    shown = set(layout["3D!limbloc"]["topics"])
-    assert shown == {f"/{t}" for t in (topics.HULL, topics.SURFACE, topics.MARKERS, topics.JOINTS, topics.TRUE_JOINTS)}
-    assert layout["Image!mask0"]["imageMode"]["imageTopic"] == f"/{topics.mask_compressed('cam0')}"
-    wanted = {"head height, m": "head_centre", "pelvis x, m": "pelvis_centre", "pelvis y, m": "pelvis_centre"}
-    for path in layout["Plot!angles"]["paths"]:
-        assert f"/joints.poses[{JOINT[wanted[path['label']]]}].position." in path["value"]
 
 
 @pytest.mark.parametrize("topic", [topics.HULL, topics.SURFACE, topics.MARKERS, topics.TRUE_JOINTS])

@@ -45,6 +45,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--person", choices=("man", "woman", "child", "heavy"), default="man", help="who moves")
     parser.add_argument("--out", type=Path, help="folder for the results (default: out/demo-<date>)")
     parser.add_argument("--domain", type=int, metavar="ID", help="ROS_DOMAIN_ID (default: the shell's, or a free one)")
+    parser.add_argument(
+        "--foxglove", nargs="?", type=int, const=0, metavar="PORT", help="show it in Foxglove too, as in `limbloc run`"
+    )
     parser.add_argument("--no-report", action="store_true", help="leave the report and the angles out, only run live")
     parser.add_argument("--set", metavar="KEY=VALUE", action="append", default=[], help="as in `limbloc run`")
 
@@ -92,6 +95,7 @@ def _run_live(args: argparse.Namespace, out: Path) -> None:
         bag=None,
         cameras=None,
         record=str((out / "bag").resolve()),
+        foxglove=args.foxglove,
         set=settings,
     )
     config = config_from_arguments(options)

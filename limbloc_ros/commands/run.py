@@ -23,4 +23,4 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Do it."""
-    return smart_space.run(smart_space.config_from_arguments(args), args.foxglove)
+    return smart_space.run(smart_space.config_from_arguments(args))

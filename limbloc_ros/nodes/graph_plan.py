@@ -25,7 +25,7 @@ from limbloc_ros.ros.supervisor import ProcessConfig, ProcessPlan
 from limbloc_ros.simulation.room import default_rig
 
 #: Sections that hold parameters of nodes, and so names that we do not check here.
-NODE_SECTIONS = ("segmentation", "carving", "pose", "simulated_cameras", "replay", "record")
+NODE_SECTIONS = ("segmentation", "carving", "pose", "simulated_cameras", "replay", "record", "foxglove_bridge")
 
 #: In a stepped replay the clock stands still while a slow machine works; do not give a mask up meanwhile.
 STEPPED_TIMEOUT_S = 5.0
@@ -46,6 +46,7 @@ class SmartSpaceConfig:
     transport: str = setting("raw", "image topics that are read", choices=("raw", "compressed"))
     record_to: str = setting("", "record the run to this new folder")
     stop_with_bag: bool = setting(True, "stop everything when the recording ends")
+    foxglove: bool = setting(False, "serve the graph to Foxglove, for people who look at it in a browser")
     processes: ProcessConfig = field(default_factory=ProcessConfig)
     network: NetworkConfig = field(default_factory=NetworkConfig)
     segmentation: dict[str, Any] = field(default_factory=dict)
@@ -55,6 +56,7 @@ class SmartSpaceConfig:
     simulated_cameras: dict[str, Any] = field(default_factory=dict)
     replay: dict[str, Any] = field(default_factory=dict)
     record: dict[str, Any] = field(default_factory=dict)
+    foxglove_bridge: dict[str, Any] = field(default_factory=dict)
 
 
 def load_config(path: str | Path, overrides: Mapping[str, Any] | None = None) -> SmartSpaceConfig:
@@ -232,11 +234,13 @@ class _Plan:
             self._add("pose", pose)
         if c.record_to:
             self._add("record", _node("record", "record", {**c.record, "bag": c.record_to}))
+        if c.foxglove:
+            self._add("foxglove", _node("foxglove_bridge", "foxglove_bridge", c.foxglove_bridge))
         return self.processes
 
     def _add(self, name: str, *nodes: dict[str, Any], ends_graph: bool = False) -> None:
         for node in nodes:
-            if self.sim_time and node["kind"] not in ("replay", "record"):
+            if self.sim_time and node["kind"] not in ("replay", "record", "foxglove_bridge"):
                 node["parameters"].setdefault("use_sim_time", True)
         self.processes.append(ProcessPlan(name, self.namespace, nodes, ends_graph))
 

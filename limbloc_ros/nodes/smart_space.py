@@ -16,7 +16,7 @@ from rclpy.utilities import remove_ros_args
 from limbloc_ros.core.errors import ConfigError, LimblocError
 from limbloc_ros.nodes.graph_plan import SmartSpaceConfig, load_config, plan_graph
 from limbloc_ros.ros.environment import config_file, graph_environment
-from limbloc_ros.ros.supervisor import ProcessPlan, Supervisor
+from limbloc_ros.ros.supervisor import Supervisor
 
 EXAMPLES = """examples:
   smart_space                                          eight simulated cameras, and a person who moves
@@ -39,7 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--foxglove",
         nargs="?",
         type=int,
-        const=8765,
+        const=0,
         metavar="PORT",
         help="also serve the graph to Foxglove on this machine (default port: 8765; needs the extra `foxglove`)",
     )
@@ -74,26 +74,23 @@ def config_from_arguments(options: argparse.Namespace) -> SmartSpaceConfig:
             overrides[key] = value
     if options.record is not None:
         overrides["record_to"] = options.record
+    if options.foxglove is not None:
+        overrides["foxglove"] = True
+        if options.foxglove:
+            overrides.setdefault("foxglove_bridge", {})["port"] = options.foxglove
     if options.cameras is not None:
         overrides["cameras"] = [name.strip() for name in options.cameras.split(",") if name.strip()]
     return load_config(options.config or config_file("smart_space.yaml"), overrides)
 
 
-def run(config: SmartSpaceConfig, foxglove_port: int | None = None) -> int:
+def run(config: SmartSpaceConfig) -> int:
     """Plan, start, watch and stop; returns the exit code.
-
-    Args:
-        config: from `config_from_arguments`.
-        foxglove_port: where to serve the graph to Foxglove; None: not at all.
 
     Raises:
         LimblocError: the config, rig or bag cannot be used.
     """
     with tempfile.TemporaryDirectory(prefix="limbloc_") as folder:
         plans = plan_graph(config, Path(folder))
-        if foxglove_port is not None:
-            bridge = {"kind": "foxglove_bridge", "name": "foxglove_bridge", "parameters": {"port": foxglove_port}}
-            plans.append(ProcessPlan("foxglove", "", (bridge,)))
         environment = graph_environment(config.network)
         print(f"smart space: source {config.source}, {len(plans)} processes. Ctrl-C stops everything")
         for plan in plans:
@@ -110,7 +107,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     add_arguments(parser)
     options = parser.parse_args(remove_ros_args(list(sys.argv if argv is None else ["smart_space", *argv]))[1:])
     try:
-        return run(config_from_arguments(options), options.foxglove)
+        return run(config_from_arguments(options))
     except LimblocError as error:
         print(f"smart_space: {error}", file=sys.stderr)
         return 1

@@ -31,11 +31,13 @@ GRAPH_KEYS = (
     "transport",
     "record_to",
     "stop_with_bag",
+    "foxglove",
     "processes",
     "network",
     "simulated_cameras",
     "replay",
     "record",
+    "foxglove_bridge",
 )
 
 
