@@ -198,6 +198,23 @@ def test_the_room_is_learned_from_the_first_frames(tmp_path):
     assert sets[6].images["a"].shape == (HEIGHT, WIDTH, 3)
 
 
+def test_somebody_who_moves_while_the_room_is_learned_is_reported_at_once(tmp_path):
+    write_walk(tmp_path / "empty" / "a", empty=6)
+    write_walk(tmp_path / "full" / "a", empty=0)
+    config = {"a": BackgroundConfig(learning_frames=6, min_blob_px=20)}
+    calm = FolderSource(tmp_path / "empty", make_rig("a"), config)
+    assert list(calm.mask_sets())
+    assert calm.notes == []
+    assert calm.about["background"] == "learned from the first 6 frames"
+    full = FolderSource(tmp_path / "full", make_rig("a"), config)
+    sets = full.mask_sets()
+    for _ in range(6):
+        next(sets)
+    (note,) = full.notes  # before the end of the recording
+    for words in ("WARNING: camera a", "first 6 frames", "--background estimate"):
+        assert words in note
+
+
 def test_the_room_is_taken_from_a_picture(tmp_path):
     wall = write_walk(tmp_path / "video" / "a")
     (tmp_path / "empty").mkdir()

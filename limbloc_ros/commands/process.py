@@ -107,6 +107,8 @@ def run(args: argparse.Namespace) -> int:
     partial = out.with_name(f"{out.name}.partial") if only_joints else out / ".partial"
     kept = KeptFrames()
     say(f"{source.about['kind']} {args.input}: {len(source.rig.cameras)} cameras, engine {config.fit.engine}")
+    if "background" in source.about:
+        say(f"background of the room: {source.about['background']}")
     started = time.monotonic()
     offline.prepare(say)
     total = None if source.frames is None else source.frames - args.leave_out

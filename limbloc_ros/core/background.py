@@ -47,6 +47,10 @@ PATIENCE = 3
 LEARNED_ROWS = 8
 """Every row of pixels learns from every eighth image, with a rate to match: the same background in less time."""
 
+RESTLESS_SIGMA, UNREST = 10.0, 0.005
+"""A pixel that varied more than this (grey levels) while the background was learned was not empty; and the share of
+such pixels from which on somebody must have moved. Empty rooms had none, rooms with somebody who walks 3 to 20 %."""
+
 _RIM = np.ones((5, 5), dtype=np.uint8)
 _GRADIENT_BINS = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, float("inf"))
 
@@ -110,6 +114,7 @@ class BackgroundModel:
         self._learned = 0
         self._ready = False
         self._noise_known = False
+        self._unrest = 0.0
         self._upset = 0
         self._turn = 0
 
@@ -129,6 +134,11 @@ class BackgroundModel:
     def learning(self) -> bool:
         """Whether the background is still unknown."""
         return not self._ready
+
+    @property
+    def unrest(self) -> float:
+        """Share of the pixels that changed while the background was learned: somebody moved if it is above UNREST."""
+        return self._unrest
 
     @property
     def frozen(self) -> bool:
@@ -342,6 +352,8 @@ class BackgroundModel:
 
     def _finish_learning(self) -> None:
         self._ready = True
+        spread = self._variance.max(axis=0) / np.float32(max(self._learned - 1, 1))
+        self._unrest = float(np.count_nonzero(spread > RESTLESS_SIGMA**2)) / spread.size
         self._noise_known = self._learned >= 5
         if self._noise_known:
             # A variance from a few frames is itself noisy; neighbours share their camera's noise.

@@ -15,7 +15,7 @@ from sensor_msgs.msg import CompressedImage, Image
 from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
 
-from limbloc_ros.core.background import BackgroundModel, Segmentation, warm_up
+from limbloc_ros.core.background import UNREST, BackgroundModel, Segmentation, warm_up
 from limbloc_ros.core.config import BackgroundConfig, setting
 from limbloc_ros.core.errors import InputError
 from limbloc_ros.core.images import Pixels
@@ -174,6 +174,12 @@ class SegmentationNode(Node):
             elif self.last.learning:
                 progress = f"{self.last.frames_learned} of {wanted} images"
                 level, message = WARN, f"learning the background ({progress}): keep the room empty"
+        if level == OK and self.model.unrest > UNREST:
+            level = WARN
+            message = (
+                f"{100 * self.model.unrest:.0f} % of the image moved while the background was learned: "
+                f"empty the room and call {self.get_name()}/recapture_background"
+            )
         if level == OK and self.backlog.behind:
             level, message = WARN, self.backlog.behind
         if self.meter.silence_s > SILENT_S:

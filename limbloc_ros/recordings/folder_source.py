@@ -14,7 +14,15 @@ from numpy.typing import NDArray
 from limbloc_ros.core.background import estimate_background
 from limbloc_ros.core.camera import Rig
 from limbloc_ros.core.errors import InputError
-from limbloc_ros.recordings.sources import Backgrounds, MaskSet, Segmenter, check_size, file_identity, rig_identity
+from limbloc_ros.recordings.sources import (
+    Backgrounds,
+    MaskSet,
+    Segmenter,
+    background_story,
+    check_size,
+    file_identity,
+    rig_identity,
+)
 from limbloc_ros.recordings.videos import Stream, find_streams
 
 Pixels = NDArray[np.uint8]
@@ -64,6 +72,8 @@ class FolderSource:
             "fps": self._fps,
             "consecutive": True,
         }
+        if not are_masks:
+            self.about["background"] = background_story(config, rig, self._pictures, estimate)
         self.identity = [
             "folder",
             {name: [file_identity(f) for f in stream.files] for name, stream in self._streams.items()},
@@ -101,6 +111,7 @@ class FolderSource:
 
     def _segmenter(self) -> Segmenter:
         segmenter = Segmenter(self.rig, self._config, self._pictures)
+        segmenter.notes = self.notes
         if self._estimate:
             step = max(1, len(self._numbers) // ESTIMATE_FRAMES)
             for name, stream in self._streams.items():

@@ -107,6 +107,7 @@ def process(
             angles.resume(frame.outcome, frame.stamp_ns)
     kept = kept if kept is not None else KeptFrames()
     progress(len(frames), total)
+    told = 0
     try:
         for frame in _fitted(source, config, jobs, _Part(leave_out, len(done)), kept):
             if angles is not None:
@@ -114,6 +115,9 @@ def process(
             frames.append(frame)
             checkpoint.add(frame)
             progress(len(frames), total)
+            for note in source.notes[told:]:  # at once: who is told only at the end has waited in vain
+                say(note)
+            told = len(source.notes)
     except KeyboardInterrupt:
         raise Interrupted(_how_to_go_on(len(frames), total, keep, config)) from None
     except BrokenProcessPool:
@@ -123,7 +127,7 @@ def process(
         ) from None
     finally:
         checkpoint.flush()
-    for note in source.notes:
+    for note in source.notes[told:]:
         say(note)
     if not frames:
         raise InputError(f"{source.about['input']}: no frame could be made of it; " + "; ".join(source.notes))

@@ -16,7 +16,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from limbloc_ros.core.background import BackgroundModel
+from limbloc_ros.core.background import UNREST, BackgroundModel
 from limbloc_ros.core.camera import Rig
 from limbloc_ros.core.config import BackgroundConfig, SyncConfig
 from limbloc_ros.core.errors import InputError
@@ -114,6 +114,8 @@ class BagSource:
             "messages": sum(counts),
             "consecutive": True,
         }
+        if any(not stream.is_mask for stream in self._streams.values()):
+            self.about["background"] = background_story(background, rig, self._pictures)
         files = sorted(path.iterdir()) if path.is_dir() else [path]
         self.identity = ["bag", [file_identity(f) for f in files if f.suffix in SUFFIXES], rig_identity(rig)]
         self.notes: list[str] = []
@@ -122,6 +124,7 @@ class BagSource:
         """The frames in the order of their stamps; images are segmented."""
         self.notes.clear()
         segmenter = Segmenter(self.rig, self._background, self._pictures)
+        segmenter.notes = self.notes
         synchroniser: StampSynchroniser[BagFrame] = StampSynchroniser.from_config(
             self.rig.names, self._sync, self._min_cameras
         )
@@ -164,10 +167,12 @@ class Segmenter:
 
     Attributes:
         models: camera name -> its background model.
+        notes: what a person should know about the backgrounds.
     """
 
     def __init__(self, rig: Rig, config: Backgrounds, pictures: Mapping[str, Pixels]) -> None:
         self._rig = rig
+        self.notes: list[str] = []
         self.models = {name: BackgroundModel(config[name]) for name in rig.names}
         for name, picture in pictures.items():
             check_size(picture, rig, name, "its background picture")
@@ -182,13 +187,32 @@ class Segmenter:
         results = {}
         for name, image in images.items():
             check_size(image, self._rig, name, "its image")
-            results[name] = self.models[name].segment(image)
+            model = self.models[name]
+            learned_before = not model.learning
+            results[name] = model.segment(image)
+            if not learned_before and not model.learning and model.unrest > UNREST:
+                self.notes.append(
+                    f"WARNING: camera {name}: {100 * model.unrest:.0f} % of the picture moved while its background was "
+                    f"learned from the first {model.config.learning_frames} frames, which must show the empty room; "
+                    "its masks will have holes and ghosts. Give --background FOLDER, pictures of the empty room, or "
+                    "--background estimate for videos of somebody who moves about"
+                )
         reason = ""
         if all(result.learning for result in results.values()):
             name, least = min(results.items(), key=lambda item: item[1].frames_learned)
             wanted = self.models[name].config.learning_frames
             reason = f"learning the background ({least.frames_learned} of {wanted} frames)"
         return {name: result.mask for name, result in results.items()}, reason
+
+
+def background_story(config: Backgrounds, rig: Rig, pictures: Mapping[str, Pixels], estimate: bool = False) -> str:
+    """Where the backgrounds of images come from, in words."""
+    if estimate:
+        return "guessed from all frames"
+    if pictures:
+        return "pictures of the empty room"
+    wanted = sorted({config[name].learning_frames for name in rig.names})
+    return f"learned from the first {' to '.join(str(n) for n in (wanted[0], wanted[-1])[: len(wanted)])} frames"
 
 
 def check_size(pixels: Pixels, rig: Rig, name: str, what: str) -> None:
