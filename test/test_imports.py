@@ -76,7 +76,7 @@ ROS = {
 }
 OUTSIDE = {
     "core": NUMERIC,
-    "rig": NUMERIC | {"yaml"},
+    "rig": NUMERIC | {"yaml", "matplotlib", "mpl_toolkits"},
     "simulation": NUMERIC,
     "recordings": NUMERIC | {"yaml", "rosbags"},
     "export": NUMERIC | {"ezc3d"},

@@ -16,11 +16,6 @@ from limbloc_ros.rig.rig_file import MODEL_ALIASES
 CAMERA_INFO, TF = "sensor_msgs/msg/CameraInfo", "tf2_msgs/msg/TFMessage"
 
 
-def is_bag(path: Path) -> bool:
-    """Whether `path` is a rosbag2 folder or file."""
-    return path.suffix in (".mcap", ".db3") or (path / "metadata.yaml").is_file()
-
-
 def bag_intrinsics(path: Path) -> tuple[Reading, dict[str, str]]:
     """The first CameraInfo of every camera.
 

@@ -24,6 +24,7 @@ examples:
 ACTIONS = {
     "import": "read another tool's calibration and make a rig file of it",
     "export": "write a rig file for another tool",
+    "calibrate": "calibrate all cameras with a checkerboard or ChArUco board",
 }
 
 

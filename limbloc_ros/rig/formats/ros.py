@@ -224,7 +224,7 @@ def write(rig: Rig, path: Path) -> list[str]:
     """Write a folder: `<camera>.yaml` each, as a camera driver's camera_info_url wants it, and `tf_static.yaml`."""
     transforms = []
     for camera in rig.cameras:
-        write_text(path / f"{camera.name}.yaml", _ost(camera))
+        write_intrinsics(camera, path / f"{camera.name}.yaml")
         T = camera.T_world_camera
         q = Rotation.from_matrix(T[:3, :3]).as_quat()
         transforms += [
@@ -238,7 +238,8 @@ def write(rig: Rig, path: Path) -> list[str]:
     return ["CameraInfo and TF hold no carve volume and no regions to ignore"]
 
 
-def _ost(camera: Camera) -> str:
+def write_intrinsics(camera: Camera, path: Path) -> None:
+    """Write one camera's lens in camera_calibration's layout."""
     names = {"none": "plumb_bob", "radtan": "plumb_bob", "rational": "rational_polynomial", "fisheye": "equidistant"}
     distortion = camera.distortion
     if camera.distortion_model in ("none", "radtan"):
@@ -259,7 +260,7 @@ def _ost(camera: Camera) -> str:
     for key, values in blocks:
         rows, cols = values.shape
         lines += [f"{key}:", f"  rows: {rows}", f"  cols: {cols}", f"  data: {row(values)}"]
-    return "\n".join(lines) + "\n"
+    write_text(path, "\n".join(lines) + "\n")
 
 
 FORMAT = Format(

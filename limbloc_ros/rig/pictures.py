@@ -1,0 +1,165 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pictures of a rig: the cameras in their room, what they see, and where a calibration board has been."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
+from numpy.typing import NDArray
+
+from limbloc_ros.core.camera import Camera
+
+Array = NDArray[np.float64]
+
+DPI = 110
+#: Colours that also colour-blind people tell apart, one after the other for the cameras.
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#7f7f7f", "#5d3a9b")
+
+
+def colour(index: int) -> str:
+    """The colour of a camera by its number."""
+    return COLOURS[index % len(COLOURS)]
+
+
+def png(figure: Figure) -> bytes:
+    """A figure as PNG."""
+    FigureCanvasAgg(figure)
+    out = io.BytesIO()
+    figure.savefig(out, format="png", dpi=DPI)
+    return out.getvalue()
+
+
+def coverage_picture(
+    cameras: Sequence[Camera], places: Sequence[Array], errors: Sequence[Array], cells: Sequence[NDArray[np.int64]]
+) -> bytes:
+    """Where in each camera's image the board's corners were found, coloured by how far off they are.
+
+    Args:
+        cameras: C cameras.
+        places: C arrays [N, 2] px.
+        errors: C arrays [N] px.
+        cells: C arrays [6, 8] of counts; empty cells are shaded.
+    """
+    columns = min(4, len(cameras))
+    rows = -(-len(cameras) // columns)
+    shape = max(camera.height / camera.width for camera in cameras)
+    figure = Figure(figsize=(3.1 * columns + 0.9, (3.1 * shape + 0.45) * rows + 0.3), layout="constrained")
+    grid = figure.subplots(rows, columns, squeeze=False)
+    limit = float(np.percentile(np.concatenate(errors), 98)) if any(map(len, errors)) else 1.0
+    dots = None
+    for i, axes in enumerate(grid.ravel()):
+        axes.set_axis_off()
+        if i >= len(cameras):
+            continue
+        camera = cameras[i]
+        extent = (-0.5, camera.width - 0.5, camera.height - 0.5, -0.5)
+        axes.imshow(np.where(cells[i] > 0, np.nan, 1.0), extent=extent, cmap="Reds", vmin=0, vmax=2.2, aspect="equal")
+        axes.plot([extent[0], extent[1], extent[1], extent[0], extent[0]],
+                  [extent[2], extent[2], extent[3], extent[3], extent[2]], color="#444444", lw=0.8)  # fmt: skip
+        dots = axes.scatter(*places[i].T, c=errors[i], s=3, cmap="viridis", vmin=0, vmax=limit, linewidths=0)
+        share = 100 * float((cells[i] > 0).mean())
+        axes.set_title(f"{camera.name}: {len(errors[i])} corners, {share:.0f} % of the image", fontsize=9)
+    if dots is not None:
+        figure.colorbar(dots, ax=grid, label="error px", shrink=0.8, aspect=30)
+    return png(figure)
+
+
+def frustum(camera: Camera, depth_m: float) -> Array:
+    """The corners of what a camera sees at a depth: [5, 3], its centre first, then around the image."""
+    w, h = camera.width - 0.5, camera.height - 0.5
+    corners = np.array([[-0.5, -0.5], [w, -0.5], [w, h], [-0.5, h]])
+    rays = (corners - camera.K[[0, 1], 2]) / camera.K[[0, 1], [0, 1]]
+    points = np.column_stack([rays * depth_m, np.full(4, depth_m)])
+    T = camera.T_world_camera
+    return np.vstack([T[:3, 3], points @ T[:3, :3].T + T[:3, 3]])
+
+
+def rig_picture(
+    cameras: Sequence[Camera],
+    low: Array,
+    high: Array,
+    *,
+    title: str = "",
+    extra: Callable[[Any], None] | None = None,
+    person_m: float = 1.75,
+) -> bytes:
+    """The cameras with their views in 3D: from the side, and from above.
+
+    Args:
+        cameras: to draw.
+        low, high: corners of the carve volume, m.
+        title: of the picture.
+        extra: draws more into the 3D axes.
+        person_m: height of the person drawn in the middle of the volume for scale; 0 for none.
+    """
+    figure = Figure(figsize=(11.5, 5.4), layout="constrained")
+    if title:
+        figure.suptitle(title, fontsize=11)
+    for column, (elevation, azimuth) in enumerate(((24, -62), (90, -90))):
+        axes = figure.add_subplot(1, 2, column + 1, projection="3d")
+        for i, camera in enumerate(cameras):
+            _draw_camera(axes, camera, colour(i), 0.9 if column == 0 else 1.6, label=True)
+        _draw_room(axes, low, high, person_m)
+        if extra is not None:
+            extra(axes)
+        points = np.array([camera.T_world_camera[:3, 3] for camera in cameras])
+        lowest = np.minimum(points.min(axis=0), low)
+        highest = np.maximum(points.max(axis=0), high)
+        margin = 0.3
+        axes.set(
+            xlim=(lowest[0] - margin, highest[0] + margin),
+            ylim=(lowest[1] - margin, highest[1] + margin),
+            zlim=(min(lowest[2], 0), highest[2] + margin),
+            xlabel="x m",
+            ylabel="y m",
+            zlabel="z m" if column == 0 else "",
+        )
+        spans = highest - lowest + 2 * margin
+        axes.set_box_aspect(spans, zoom=1.0)
+        axes.view_init(elevation, azimuth)
+        if column == 1:
+            axes.set_proj_type("ortho")
+            axes.set_zticks([])
+    return png(figure)
+
+
+def _draw_camera(axes: Any, camera: Camera, shade: str, depth_m: float, label: bool) -> None:
+    points = frustum(camera, depth_m)
+    centre, corners = points[0], points[1:]
+    edges = [(centre, corner) for corner in corners]
+    edges += [(corners[k], corners[(k + 1) % 4]) for k in range(4)]
+    axes.add_collection3d(Line3DCollection(edges, colors=shade, linewidths=0.9))
+    axes.add_collection3d(Poly3DCollection([corners], facecolors=shade, alpha=0.12))
+    axes.scatter(*centre, color=shade, s=18)
+    if label:
+        axes.text(centre[0], centre[1], centre[2] + 0.12, camera.name, color=shade, fontsize=8)
+
+
+def _draw_room(axes: Any, low: Array, high: Array, person_m: float) -> None:
+    x, y, z = np.stack([low, high]).T
+    corners = np.array([[x[i], y[j], z[k]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
+    pairs = [(a, b) for a in range(8) for b in range(a + 1, 8) if bin(a ^ b).count("1") == 1]
+    lines = [(corners[a], corners[b]) for a, b in pairs]
+    axes.add_collection3d(Line3DCollection(lines, colors="#888888", linewidths=0.7, linestyles="dotted"))
+    floor = corners[[0, 2, 6, 4]]
+    axes.add_collection3d(Poly3DCollection([floor], facecolors="#888888", alpha=0.10))
+    axes.quiver(0, 0, 0, 0.4, 0, 0, color="#c00000", lw=1.2)
+    axes.quiver(0, 0, 0, 0, 0.4, 0, color="#00a000", lw=1.2)
+    axes.quiver(0, 0, 0, 0, 0, 0.4, color="#0000c0", lw=1.2)
+    if person_m:
+        middle = (low + high) / 2
+        stick = np.array(
+            [
+                *[[(0, 0), (0, 1.45)], [(-0.2, 0), (0, 0.9)], [(0.2, 0), (0, 0.9)]],
+                *[[(-0.45, 1.1), (0, 1.4)], [(0.45, 1.1), (0, 1.4)], [(0, 1.5), (0, 1.75)]],
+            ]
+        )
+        upright = np.stack([stick[..., 0], np.zeros(stick.shape[:2]), stick[..., 1]], axis=-1)
+        lines = list(person_m / 1.75 * upright + [middle[0], middle[1], low[2]])
+        axes.add_collection3d(Line3DCollection(lines, colors="#333333", linewidths=2.0))
