@@ -50,7 +50,7 @@ setup(
         "numba>=0.58,<0.69",
         "opencv-python-headless>=4.6,<5",
         "PyYAML>=6,<7",
-        "rosbags>=0.11,<0.12",
+        "rosbags>=0.11.6,<0.12",
         "tqdm>=4.66,<5",
         "matplotlib>=3.6,<4",
     ],
