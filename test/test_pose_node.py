@@ -280,11 +280,12 @@ def test_from_simulated_images_to_joint_states(graph: Graph, tmp_path: Path) -> 
     rig = default_rig(6, 320, 240)
     rig_file = str(tmp_path / "rig.yaml")
     save_rig(rig, rig_file)
-    graph.add(PoseNode)  # first, because it takes seconds to load its kernels
-    graph.add(CarvingNode, rig_file=rig_file)
+    patient = {"catch_up_s": 10.0}  # one thread does it all: nothing is to be skipped while a figure is searched
+    graph.add(PoseNode, **patient)  # first, because it takes seconds to load its kernels
+    graph.add(CarvingNode, rig_file=rig_file, **patient)
     for name in rig.names:
-        node_name = f"segmentation_{name}"
-        graph.add(SegmentationNode, node_name, camera=name, background__learning_frames=5, reliability="reliable")
+        camera = {"camera": name, "background__learning_frames": 5, "reliability": "reliable"}
+        graph.add(SegmentationNode, f"segmentation_{name}", **camera, **patient)
     graph.add(SimulatedCamerasNode, rig_file=rig_file, rate_hz=3.0, empty_s=3.0)
     joints, truth = graph.collect(PoseArray, "joints"), graph.collect(PoseArray, "true_joints")
     states = graph.collect(JointState, "humans/bodies/p1/joint_states")

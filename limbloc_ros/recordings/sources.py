@@ -191,12 +191,16 @@ class Segmenter:
             learned_before = not model.learning
             results[name] = model.segment(image)
             if not learned_before and not model.learning and model.unrest > UNREST:
-                self.notes.append(
-                    f"WARNING: camera {name}: {100 * model.unrest:.0f} % of the picture moved while its background was "
-                    f"learned from the first {model.config.learning_frames} frames, which must show the empty room; "
-                    "its masks will have holes and ghosts. Give --background FOLDER, pictures of the empty room, or "
-                    "--background estimate for videos of somebody who moves about"
-                )
+                share = f"{100 * model.unrest:.0f} %"
+                if any(note.startswith("WARNING") for note in self.notes):
+                    self.notes.append(f"WARNING: camera {name}: {share} of its picture moved as well")
+                else:
+                    self.notes.append(
+                        f"WARNING: camera {name}: {share} of the picture moved while its background was learned from the "
+                        f"first {model.config.learning_frames} frames, which must show the empty room; its masks will "
+                        "have holes and ghosts. Give --background FOLDER, pictures of the empty room, or --background "
+                        "estimate for videos of somebody who moves about"
+                    )
         reason = ""
         if all(result.learning for result in results.values()):
             name, least = min(results.items(), key=lambda item: item[1].frames_learned)
