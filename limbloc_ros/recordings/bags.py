@@ -249,7 +249,8 @@ class BagWriter:
             writer = Writer(self.path, version=9, storage_plugin=STORAGES[storage])
             writer.open()
         except (WriterError, OSError, sqlite3.Error) as error:
-            raise OutputError(f"cannot record to {self.path}: {str(error).rstrip('.')}. Choose another folder or remove it") from error
+            reason = str(error).rstrip(".")
+            raise OutputError(f"cannot record to {self.path}: {reason}. Choose another folder or remove it") from error
         self._writer = writer
         self._storage: Any = writer.storage
         if storage == "sqlite3":
