@@ -198,8 +198,8 @@ class Segmenter:
                     self.notes.append(
                         f"WARNING: camera {name}: {share} of the picture moved while its background was learned from "
                         f"the first {model.config.learning_frames} frames, which must show the empty room; its masks "
-                        "will have holes and ghosts. Give --background FOLDER, pictures of the empty room, or --background "
-                        "estimate for videos of somebody who moves about"
+                        "will have holes and ghosts. Give --background FOLDER, pictures of the empty room, or "
+                        "--background estimate for videos of somebody who moves about"
                     )
         reason = ""
         if all(result.learning for result in results.values()):
