@@ -89,10 +89,10 @@ class PoseEstimator:
         """Compile or load every kernel, so that the first frame is not slow."""
         hull = Carver(*_warm_up_room()).carve(_warm_up_masks())
         assert isinstance(hull, Hull)
-        for temporal in (False, True):
-            estimator = PoseEstimator(FitConfig(temporal=temporal))
-            estimator.estimate(hull)
-            estimator.estimate(hull)
+        # The first frame is searched from scratch, as every frame alone is; the second follows.
+        estimator = PoseEstimator(FitConfig(temporal=True))
+        estimator.estimate(hull)
+        estimator.estimate(hull)
 
 
 class _Stopwatch:
