@@ -23,6 +23,7 @@ COMMANDS = {
     "record": "record the running graph into a bag",
     "report": "make pictures and a page of a finished run",
     "export": "write a finished run for other programs: CSV, TRC, C3D, BVH, glTF, PLY, video",
+    "view": "look at a finished run in 3D, in a window",
 }
 
 EPILOG = """\
