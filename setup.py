@@ -69,6 +69,7 @@ setup(
         ],
         "export": ["ezc3d>=1.5,<2"],  # C3D; the other formats need nothing
         "foxglove": ["foxglove-sdk>=0.20,<0.31"],  # a live view in a browser
+        "docs": ["mkdocs>=1.6,<2", "mkdocs-material>=9.5,<10", "mkdocstrings[python]>=0.29,<2"],
         "viewer": ["open3d-cpu>=0.19,<0.21"],
     },
     zip_safe=False,

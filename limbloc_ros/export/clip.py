@@ -91,7 +91,8 @@ def clip_of(run: Run, *, only_reliable: bool = False, first: int = 0, last: int 
     Args:
         run: the results.
         only_reliable: leave out poses that should not be acted on.
-        first, last: frames of the run to take, both included; None is the end.
+        first: the first frame of the run to take.
+        last: the last one; None is the run's end.
 
     Raises:
         InputError: no frame with a pose is left, or the stamps make no recording.
