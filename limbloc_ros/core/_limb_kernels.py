@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Numba kernels of the limb search: two-bone limbs on spheres, what they cover, the best pairs."""
+"""Numba kernels of the limb search: two-bone limbs on spheres, and what of the hull is explained already."""
 
 from __future__ import annotations
 
@@ -11,6 +11,9 @@ from numba import njit
 
 from limbloc_ros.core._figure_kernels import part_bounds, part_distance
 from limbloc_ros.core._search_kernels import depth_at, spread_out
+
+#: Ragged masks eat into limbs: a bone may be thinner than expected by this fraction of its radius at no cost.
+EATEN = 0.4
 
 
 @njit(cache=True)  # type: ignore[misc, unused-ignore]
@@ -29,9 +32,14 @@ def tube_score(
     steps: int,
     clip: float,
     skip: float,
+    most: float,
 ) -> float:
-    """Mean clipped miss of a cone between two points, from the fraction `skip` on: phi + radius, outside doubled."""
+    """Mean clipped miss of a cone between two points, from the fraction `skip` on: phi + radius, outside doubled.
+
+    Any value above `most` stands for a worse score.
+    """
     total = 0.0
+    enough = most * steps * clip * clip
     for n in range(steps):
         t = skip + (1.0 - skip) * (n + 0.5) / steps
         e = depth_at(sdf, origin, voxel, ax + t * (bx - ax), ay + t * (by - ay), az + t * (bz - az))
@@ -39,9 +47,11 @@ def tube_score(
             e += clip  # the bone itself lies outside: constraint 3
         e += ra + t * (rb - ra)
         if e > 0.0:
-            e *= 2.0
+            e = 2.0 * max(e - EATEN * (ra + t * (rb - ra)), 0.0)
         e = min(max(e, -clip), 2.0 * clip)
         total += e * e
+        if total > enough:
+            break
     return total / (steps * clip * clip)
 
 
@@ -138,7 +148,7 @@ def search_limb(
         y = base[1] + lengths[0] * dy
         z = base[2] + lengths[0] * dz
         s = tube_score(
-            sdf, origin, voxel, base[0], base[1], base[2], x, y, z, tube_radii[0], tube_radii[1], 6, clip, skip
+            sdf, origin, voxel, base[0], base[1], base[2], x, y, z, tube_radii[0], tube_radii[1], 6, clip, skip, 3.2
         )
         if s > 3.2:
             continue
@@ -179,7 +189,7 @@ def search_limb(
             x = ex + lengths[1] * dx
             y = ey + lengths[1] * dy
             z = ez + lengths[1] * dz
-            s2 = tube_score(sdf, origin, voxel, ex, ey, ez, x, y, z, tube_radii[1], tube_radii[2], 6, clip, 0.0)
+            s2 = tube_score(sdf, origin, voxel, ex, ey, ez, x, y, z, tube_radii[1], tube_radii[2], 6, clip, 0.0, 3.2)
             if s2 > 3.2:
                 continue
             s2 += explained_weight * explained_fraction(explained, origin, stride * voxel, ex, ey, ez, x, y, z, 0.0)
@@ -200,7 +210,7 @@ def search_limb(
     order = np.argsort(out[:, 6])
     kept = np.empty((keep, 7))
     count = 0
-    apart2 = (0.14 * lengths[0]) ** 2
+    apart2 = (0.22 * lengths[0]) ** 2
     for n in order:
         ok = True
         for m in range(count):
@@ -218,88 +228,3 @@ def search_limb(
             if count == keep:
                 break
     return kept[:count]
-
-
-@njit(cache=True)  # type: ignore[misc, unused-ignore]
-def covered_by_limb(limb: Any, base: Any, tube_radii: Any, tip_length: float, samples: Any, reach: float) -> Any:
-    """Which samples [Q, 3] lie within `reach` of a limb (base, middle, end and its tip); uint64 bits [Q / 64]."""
-    bits = np.zeros((len(samples) + 63) // 64, np.uint64)
-    dx = limb[3] - limb[0]
-    dy = limb[4] - limb[1]
-    dz = limb[5] - limb[2]
-    length = math.sqrt(dx * dx + dy * dy + dz * dz)
-    chain = np.empty((4, 3))
-    for i in range(3):
-        chain[0, i] = base[i]
-        chain[1, i] = limb[i]
-        chain[2, i] = limb[3 + i]
-    chain[3, 0] = limb[3] + tip_length * dx / length
-    chain[3, 1] = limb[4] + tip_length * dy / length
-    chain[3, 2] = limb[5] + tip_length * dz / length
-    r = np.array([tube_radii[0], tube_radii[1], tube_radii[2], tube_radii[2]])
-    for q in range(len(samples)):
-        for s in range(3):
-            ux = chain[s + 1, 0] - chain[s, 0]
-            uy = chain[s + 1, 1] - chain[s, 1]
-            uz = chain[s + 1, 2] - chain[s, 2]
-            px = samples[q, 0] - chain[s, 0]
-            py = samples[q, 1] - chain[s, 1]
-            pz = samples[q, 2] - chain[s, 2]
-            t = (px * ux + py * uy + pz * uz) / (ux * ux + uy * uy + uz * uz)
-            t = min(max(t, 0.0), 1.0)
-            x = px - t * ux
-            y = py - t * uy
-            z = pz - t * uz
-            limit = r[s] + t * (r[s + 1] - r[s]) + reach
-            if x * x + y * y + z * z < limit * limit:
-                bits[q // 64] |= np.uint64(1) << np.uint64(q % 64)
-                break
-    return bits
-
-
-@njit(cache=True, inline="always")  # type: ignore[misc, unused-ignore]
-def popcount(v: Any) -> Any:
-    """Number of set bits of a uint64."""
-    v = v - ((v >> np.uint64(1)) & np.uint64(0x5555555555555555))
-    v = (v & np.uint64(0x3333333333333333)) + ((v >> np.uint64(2)) & np.uint64(0x3333333333333333))
-    v = (v + (v >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
-    return (v * np.uint64(0x0101010101010101)) >> np.uint64(56)
-
-
-@njit(cache=True)  # type: ignore[misc, unused-ignore]
-def best_pairs(
-    left: Any,
-    right: Any,
-    left_bits: Any,
-    right_bits: Any,
-    taken: Any,
-    samples: int,
-    trade: float,
-    apart: float,
-    keep: int,
-) -> Any:
-    """Pairs of limbs by coverage: samples that neither explains cost, so do the limbs' own misses times `trade`.
-
-    Pairs whose ends or middles coincide (nearer than `apart`) explain one limb twice and pay for it.
-    Returns float64 [M, 3]: index left, index right, cost; the best first.
-    """
-    out = np.empty((len(left) * len(right), 3))
-    n = 0
-    for a in range(len(left)):
-        for b in range(len(right)):
-            covered = 0
-            for k in range(len(taken)):
-                covered += int(popcount(left_bits[a, k] | right_bits[b, k] | taken[k]))
-            cost = (samples - covered) / samples + trade * (left[a, 6] + right[b, 6])
-            for first in (0, 3):
-                d = 0.0
-                for i in range(3):
-                    d += (left[a, first + i] - right[b, first + i]) ** 2
-                if d < apart * apart:
-                    cost += 0.05 * (1.0 - math.sqrt(d) / apart)
-            out[n, 0] = a
-            out[n, 1] = b
-            out[n, 2] = cost
-            n += 1
-    order = np.argsort(out[:, 2])[:keep]
-    return out[order]

@@ -49,6 +49,8 @@ class Evidence:
     Attributes:
         points: [Q, 3] on the hull's surface, m, world.
         normals: [Q, 3] outward.
+        rays: [Q, 3] unit direction in which the camera that cut the hull at a point looks at it; zero where the
+            point itself is to be explained, not just some point of its ray.
         point_weights: [Q], they sum to 1.
         sdf: float32 [nx, ny, nz], m.
         origin: [3] centre of sdf[0, 0, 0], m, world.
@@ -57,6 +59,7 @@ class Evidence:
 
     points: Array
     normals: Array
+    rays: Array
     point_weights: Array
     sdf: NDArray[np.float32]
     origin: Array
@@ -208,6 +211,7 @@ def system(state: FigureState, evidence: Evidence, weights: Weights) -> System:
     cost = kernels.surface_term(
         evidence.points,
         evidence.normals,
+        evidence.rays,
         w.surface * evidence.point_weights,
         *flesh,
         w.surface_width_m,

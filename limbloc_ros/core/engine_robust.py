@@ -3,41 +3,106 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from limbloc_ros.core import energy, figure, lm, search
-from limbloc_ros.core._figure_kernels import flesh_distance
 from limbloc_ros.core.energy import Evidence, Weights
 from limbloc_ros.core.figure import FigureState
 from limbloc_ros.core.hull import Hull
+from limbloc_ros.core.limb_pairs import limb_pairs, with_limb
 from limbloc_ros.core.search import ARM, LEG, Medial
 from limbloc_ros.core.surface import Surface
 
 Array = NDArray[np.float64]
+Refined = lm.LmResult[FigureState]
 
 
 @dataclass(frozen=True)
 class Effort:
-    """How much is searched; the defaults are for one frame alone."""
+    """How much is searched; the defaults are for one frame alone.
 
-    torsos: int = 8
-    arm_pairs: int = 4
-    repairs: int = 12
+    Attributes:
+        torsos: torso hypotheses, each tried with both facings.
+        leg_pairs: pairs of legs tried on each.
+        starts: figures with legs and arms, of all these, that are refined.
+        survivors, repaired: of these, so many are refined further, and so many get their limbs looked for again ...
+        arm_repairs, leg_repairs: ... with so many other pairs of arms, and of legs and arms.
+        finalists: so many are refined on all points; the one of lowest energy is the result.
+        quick_points, points: surface points until then, and then.
+        iterations: most steps of the refinements: first, survivors, repairs, under strict limits, final.
+        lenient_limits: weight of joint limits at first.
+    """
+
+    torsos: int = 4
+    leg_pairs: int = 3
+    starts: int = 10
+    survivors: int = 4
+    repaired: int = 3
+    arm_repairs: int = 3
+    leg_repairs: int = 1
+    strict: int = 4
+    finalists: int = 2
     quick_points: int = 350
-    quick_iterations: int = 8
-    finalists: int = 5
-    points: int = 1200
-    iterations: int = 20
+    points: int = 1000
+    iterations: tuple[int, int, int, int, int] = (3, 5, 6, 4, 12)
+    lenient_limits: float = 3e-3
 
 
-def gather_evidence(hull: Hull, surface: Surface, points: int, rng: np.random.Generator) -> Evidence:
-    """A random but even sample of the surface, and the signed distance grid."""
+#: Tried when the energy (m^2) stays above DOUBTFUL_COST.
+HARDER = Effort(torsos=14, leg_pairs=4, starts=24, survivors=8, repaired=4)
+DOUBTFUL_COST = 5e-4
+
+#: Candidates for one limb.
+CANDIDATES = 80
+
+_LIMB_BASES = ("upper_arm", "forearm", "hand")
+BODY_PARTS = np.array([p for p, name in enumerate(figure.PART_NAMES) if not name.startswith(_LIMB_BASES)])
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A fitted figure and how it came about.
+
+    Attributes:
+        state: the figure.
+        system: energy, gradient and matrix there.
+        runner_up: energy of the next best finalist, m^2.
+    """
+
+    state: FigureState
+    system: lm.System
+    runner_up: float
+
+
+def gather_evidence(
+    hull: Hull, surface: Surface, points: int, rng: np.random.Generator, themselves_every: int = 4
+) -> Evidence:
+    """A random but even sample of the surface, and the signed distance grid.
+
+    The hull holds more than the body, the more so the fewer cameras there are; its surface there is phantom. But each
+    of its points lies on a viewing ray along the outline of some silhouette, and that ray touches the body. So every
+    `themselves_every`-th point asks to be explained itself, which leads from far off, the others that their ray be.
+    """
     rows = np.sort(rng.permutation(len(surface))[:points])
+    rays = outline_rays(hull, surface, rows)
+    rays[::themselves_every] = 0.0
     weights = np.full(len(rows), 1.0 / len(rows))
-    return Evidence(surface.points[rows], surface.normals[rows], weights, hull.sdf, hull.origin_m, hull.voxel_m)
+    return Evidence(surface.points[rows], surface.normals[rows], rays, weights, hull.sdf, hull.origin_m, hull.voxel_m)
+
+
+def outline_rays(hull: Hull, surface: Surface, rows: NDArray[np.int64]) -> Array:
+    """[Q, 3] unit directions in which the cameras that cut the hull there look at points of its surface; 0: unknown."""
+    if hull.cut_by is None:
+        return np.zeros((len(rows), 3))
+    local = surface.indices[rows] - np.asarray(hull.index_min)
+    who = hull.cut_by[local[:, 0], local[:, 1], local[:, 2]].astype(np.int64)
+    known = who < len(hull.viewpoints)
+    rays = surface.points[rows] - hull.viewpoints[np.where(known, who, 0)].astype(np.float64)
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    return np.where(known[:, None], rays, 0.0)
 
 
 def refine(state: FigureState, evidence: Evidence, weights: Weights, iterations: int) -> lm.LmResult[FigureState]:
@@ -55,148 +120,129 @@ def refine(state: FigureState, evidence: Evidence, weights: Weights, iterations:
     )
 
 
-#: A surface point this near to the flesh counts as explained.
-EXPLAINED_M = 0.04
+@dataclass(frozen=True)
+class Scene:
+    """One hull, made ready for the search.
 
-_LIMB_BASES = ("upper_arm", "forearm", "hand")
-BODY_PARTS = np.array([p for p, name in enumerate(figure.PART_NAMES) if not name.startswith(_LIMB_BASES)])
+    Attributes:
+        hull, medial: the volume.
+        quick, full: few and many surface points.
+        lenient, weights: the energy's weights, at first and in the end. Limbs are placed with a guess of their turn
+            about themselves, so joint limits give way until that has settled.
+    """
+
+    hull: Hull
+    medial: Medial
+    quick: Evidence
+    full: Evidence
+    lenient: Weights
+    weights: Weights
 
 
-def with_legs(state: FigureState, hull: Hull, medial: Medial, samples: Array, pairs: int) -> list[FigureState]:
-    """The figure with each of the best pairs of legs: those that explain most of the hull beside the trunk."""
-    return _with_pairs(state, hull, medial, samples, LEG, search.TRUNK_PARTS, search.UPPER_TRUNK_PARTS, pairs)
+def with_legs(state: FigureState, scene: Scene, pairs: int) -> list[FigureState]:
+    """The figure with each of the best pairs of legs."""
+    return _with_pairs(state, scene, LEG, search.TRUNK_PARTS, search.UPPER_TRUNK_PARTS, pairs)
 
 
-def with_arms(state: FigureState, hull: Hull, medial: Medial, samples: Array, pairs: int) -> list[FigureState]:
+def with_arms(state: FigureState, scene: Scene, pairs: int) -> list[FigureState]:
     """The figure, which has legs, with each of the best pairs of arms."""
-    return _with_pairs(state, hull, medial, samples, ARM, BODY_PARTS, BODY_PARTS, pairs)
+    return _with_pairs(state, scene, ARM, BODY_PARTS, BODY_PARTS, pairs)
 
 
 def _with_pairs(
     state: FigureState,
-    hull: Hull,
-    medial: Medial,
-    samples: Array,
+    scene: Scene,
     kind: search.LimbKind,
-    explaining: NDArray[np.int64],
+    body: NDArray[np.int64],
     solid: NDArray[np.int64],
     pairs: int,
 ) -> list[FigureState]:
     placed = figure.place(state)
-    distance, _ = flesh_distance(samples, figure.PART_SPHERES[explaining], placed.spheres, placed.radii)
+    hull = scene.hull
     taken = search.explained_volume(hull, placed, solid)
-    left, right = (search.limb_candidates(hull, medial, placed, kind, side, taken, 40) for side in "LR")
+    left, right = (search.limb_candidates(hull, scene.medial, placed, kind, side, taken, CANDIDATES) for side in "LR")
     out = []
-    for a, b, _ in search.limb_pairs(left, right, samples, distance < EXPLAINED_M, 0.02, pairs):
-        limbed = search.with_limb(state, placed, kind, "L", left.found[a])
-        out.append(search.with_limb(limbed, placed, kind, "R", right.found[b]))
+    for a, b, _ in limb_pairs(placed, left, right, kind, body, scene.quick, scene.lenient, pairs):
+        limbed = with_limb(state, placed, kind, "L", left.found[a])
+        out.append(with_limb(limbed, placed, kind, "R", right.found[b]))
     return out or [state]
 
 
-def by_cost(states: list[FigureState], evidence: Evidence, weights: Weights, keep: int) -> list[FigureState]:
-    """The states of lowest energy as they are, before any refinement."""
-    costs = [energy.system(state, evidence, weights).cost for state in states]
-    return [states[i] for i in np.argsort(costs, kind="stable")[:keep]]
-
-
-@dataclass(frozen=True)
-class Fit:
-    """A fitted figure and how it came about."""
-
-    state: FigureState
-    system: lm.System
-    runner_up: float
+def make_scene(hull: Hull, surface: Surface, seed: int, weights: Weights, effort: Effort) -> Scene:
+    """What the search reads of a hull."""
+    rng = np.random.default_rng(seed)
+    quick = gather_evidence(hull, surface, effort.quick_points, rng, themselves_every=2)
+    full = gather_evidence(hull, surface, effort.points, rng)
+    return Scene(hull, Medial.of(hull), quick, full, replace(weights, limits=effort.lenient_limits), weights)
 
 
 def fit_from_scratch(
-    hull: Hull, surface: Surface, seed: int, weights: Weights | None = None, effort: Effort | None = None
+    hull: Hull,
+    surface: Surface,
+    seed: int,
+    weights: Weights | None = None,
+    effort: Effort | None = None,
+    harder: Effort | None = HARDER,
 ) -> Fit | None:
-    """Fit one frame alone: torso hypotheses, both facings, limbs, refinement, arm repair."""
-    weights, effort = weights or Weights(), effort or Effort()
-    rng = np.random.default_rng(seed)
-    medial = Medial.of(hull)
-    quick = gather_evidence(hull, surface, effort.quick_points, rng)
-    full = gather_evidence(hull, surface, effort.points, rng)
-    torsos = search.torso_hypotheses(hull, medial, rng, effort.torsos)
-    starts: list[FigureState] = []
-    for torso, _ in torsos:
-        for facing in (torso, search.turned_about(torso)):
-            for standing in with_legs(facing, hull, medial, quick.points, 1):
-                starts += by_cost(with_arms(standing, hull, medial, quick.points, effort.arm_pairs), quick, weights, 1)
-    if not starts:
+    """Fit one frame alone: torso hypotheses, both facings, limbs, refinement, limb repair.
+
+    Args:
+        hull, surface: the frame.
+        seed: of the random sample of surface points and of the torso search.
+        weights: of the energy's terms.
+        effort: how much is searched at first.
+        harder: how much is searched again when the energy stays high; None: nothing.
+
+    Returns:
+        the fit of lowest energy, or None when no torso fits into the hull.
+    """
+    effort = effort or Effort()
+    scene = make_scene(hull, surface, seed, weights or Weights(), effort)
+    torsos = [
+        facing
+        for torso, _ in search.torso_hypotheses(hull, scene.medial, np.random.default_rng(seed), HARDER.torsos)
+        for facing in (torso, search.turned_about(torso))
+    ]
+    if not torsos:
         return None
-    candidates = [refine(state, quick, weights, effort.quick_iterations) for state in starts]
-    candidates.sort(key=lambda r: r.system.cost)
-    finalists = candidates[: effort.finalists]
-    for candidate in candidates[: effort.finalists]:
-        repaired = with_arms(candidate.state, hull, medial, quick.points, effort.repairs)
-        for standing in with_legs(candidate.state, hull, medial, quick.points, 2):
-            repaired += with_arms(standing, hull, medial, quick.points, effort.repairs // 2)
-        for state in by_cost(repaired, quick, weights, 2):
-            finalists.append(refine(state, quick, weights, effort.quick_iterations))
-    finalists.sort(key=lambda r: r.system.cost)
-    best = [refine(r.state, full, weights, effort.iterations) for r in finalists[:2]]
-    best.sort(key=lambda r: r.system.cost)
+    fit = _fit_from_torsos(torsos[: 2 * effort.torsos], scene, effort)
+    if harder is not None and fit.system.cost > DOUBTFUL_COST:
+        again = _fit_from_torsos(torsos[: 2 * harder.torsos], scene, harder)
+        if again.system.cost < fit.system.cost:
+            return again
+    return fit
+
+
+def _fit_from_torsos(torsos: list[FigureState], scene: Scene, effort: Effort) -> Fit:
+    first, second, repair, strict, final = effort.iterations
+    quick, lenient = scene.quick, scene.lenient
+    starts = _with_limbs(torsos, scene, effort.leg_pairs)
+    tried = [refine(state, quick, lenient, first) for state in _cheapest(starts, scene, effort.starts)]
+    tried = [refine(r.state, quick, lenient, second) for r in _best(tried, effort.survivors)]
+    # With the trunk in place and sizes adapted, limbs are looked for once more.
+    for candidate in _best(tried, effort.repaired):
+        others = with_arms(candidate.state, scene, effort.arm_repairs)
+        others += _cheapest(_with_limbs([candidate.state], scene, effort.leg_pairs), scene, effort.leg_repairs)
+        tried += [refine(state, quick, lenient, repair) for state in others]
+    tried = [refine(r.state, quick, scene.weights, strict) for r in _best(tried, effort.strict)]
+    finals = [refine(r.state, scene.full, scene.weights, final) for r in _best(tried, effort.finalists)]
+    best = _best(finals, effort.finalists)
     return Fit(best[0].state, best[0].system, best[-1].system.cost)
 
 
-class Tracker:
-    """Fits frame after frame, each from the last; starts anew when there is no last one or the fit went wrong."""
+def _with_limbs(states: list[FigureState], scene: Scene, leg_pairs: int) -> list[FigureState]:
+    return [
+        limbed
+        for state in states
+        for standing in with_legs(state, scene, leg_pairs)
+        for limbed in with_arms(standing, scene, 1)
+    ]
 
-    #: A cost this much above the usual one, or above this many m^2, is no longer believed ...
-    DOUBT, DOUBTFUL_COST = 1.35, 4.5e-4
-    #: ... but starting anew, which takes as long as many followed frames, is tried only every so many frames: in a
-    #: live room a slow fit makes the next step longer. Arms are checked as often.
-    PATIENCE = 8
-    #: What is searched when starting anew: less than for a frame alone, for the next frames can mend it.
-    SEARCH = Effort(torsos=4, finalists=2)
 
-    def __init__(self, seed: int, weights: Weights | None = None, effort: Effort | None = None) -> None:
-        self._seed, self._weights, self._effort = seed, weights or Weights(), effort or self.SEARCH
-        self.reset()
+def _cheapest(states: list[FigureState], scene: Scene, keep: int) -> list[FigureState]:
+    costs = [energy.system(state, scene.quick, scene.lenient).cost for state in states]
+    return [states[i] for i in np.argsort(costs, kind="stable")[:keep]]
 
-    def reset(self) -> None:
-        """Forget the last frame."""
-        self._last: FigureState | None = None
-        self._usual_cost = 0.0
-        self._frame = 0
-        self._last_scratch = -self.PATIENCE
-        self._centre = np.zeros(3)
 
-    def follow(self, hull: Hull, surface: Surface) -> Fit | None:
-        """Fit the next frame."""
-        self._frame += 1
-        fit: Fit | None = None
-        centre = surface.points.mean(axis=0)
-        moved, self._centre = centre - self._centre, centre
-        if self._last is not None:
-            evidence = gather_evidence(hull, surface, 600, np.random.default_rng(self._seed))
-            carried = FigureState(self._last.root + moved, self._last.rotations, self._last.shape)
-            result = refine(carried, evidence, self._weights, 10 if np.abs(moved).max() < 0.1 else 20)
-            if self._frame % self.PATIENCE == 0:
-                result = self._check_arms(result, hull, evidence)
-            fit = Fit(result.state, result.system, np.inf)
-        if fit is None or self._doubts(fit.system.cost):
-            self._last_scratch = self._frame
-            scratch = fit_from_scratch(hull, surface, self._seed, self._weights, self._effort)
-            if scratch is not None and (fit is None or scratch.system.cost < 0.95 * fit.system.cost):
-                fit = scratch
-        if fit is None:
-            self._last = None
-            return None
-        # the usual cost follows slowly, so one odd frame is judged by the calm ones before it
-        fresh = self._last is None or self._usual_cost == 0.0
-        self._usual_cost = fit.system.cost if fresh else 0.9 * self._usual_cost + 0.1 * fit.system.cost
-        self._last = fit.state
-        return fit
-
-    def _doubts(self, cost: float) -> bool:
-        waited = self._frame - self._last_scratch >= self.PATIENCE
-        return waited and (cost > self.DOUBT * self._usual_cost or cost > self.DOUBTFUL_COST)
-
-    def _check_arms(self, result: lm.LmResult[FigureState], hull: Hull, evidence: Evidence) -> lm.LmResult[FigureState]:
-        """An arm that has slipped into the trunk stays there, for its flesh is explained: look for it elsewhere."""
-        samples = evidence.points[:: max(1, len(evidence.points) // 300)]
-        others = with_arms(result.state, hull, Medial.of(hull), samples, self._effort.repairs)
-        best = refine(by_cost(others, evidence, self._weights, 1)[0], evidence, self._weights, 10)
-        return best if best.system.cost < 0.97 * result.system.cost else result
+def _best(results: list[Refined], keep: int) -> list[Refined]:
+    return sorted(results, key=lambda r: r.system.cost)[:keep]

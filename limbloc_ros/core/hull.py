@@ -36,6 +36,8 @@ ROOT, LEAF = 32, 4
 INNER_PX = 1.5
 #: Fraction of unexplained foreground from which on the cameras contradict each other as much as we distinguish.
 DOUBTED_FRACTION = 0.02
+#: In `Hull.cut_by`: no camera decided here.
+NOBODY = 255
 
 #: Lattice indices [V, 3], largest and second largest camera distance [V] m, camera of the largest [V].
 Voxels = tuple[NDArray[np.int32], NDArray[np.float32], NDArray[np.float32], NDArray[np.int16]]
@@ -52,6 +54,9 @@ class Hull:
         band_m: where the clamp lies, m.
         cameras: names of the cameras that were used.
         rejected: camera name -> why its mask was not used.
+        cut_by: uint8 [nx, ny, nz] which camera's silhouette decided the signed distance: a row of `viewpoints`, or
+            NOBODY. None if that is not known.
+        viewpoints: float32 [C, 3] centres of the cameras, m, world.
     """
 
     voxel_m: float
@@ -60,6 +65,8 @@ class Hull:
     band_m: float
     cameras: tuple[str, ...] = ()
     rejected: dict[str, str] = field(default_factory=dict)
+    cut_by: NDArray[np.uint8] | None = None
+    viewpoints: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 3), np.float32))
 
     @property
     def origin_m(self) -> NDArray[np.float64]:
@@ -89,6 +96,8 @@ class Hull:
         values: NDArray[np.float32],
         cameras: tuple[str, ...] = (),
         rejected: dict[str, str] | None = None,
+        cut_by: NDArray[np.uint8] | None = None,
+        viewpoints: NDArray[np.float32] | None = None,
     ) -> Hull:
         """Rebuild from `shell()` the very same hull, bit for bit.
 
@@ -106,7 +115,12 @@ class Hull:
         at = columns - low[:, None]
         sdf[at[0], at[1], at[2]] = values
         corner = (int(low[0]), int(low[1]), int(low[2]))
-        return Hull(voxel_m, corner, sdf, band_m, cameras, rejected or {})
+        hull = Hull(voxel_m, corner, sdf, band_m, cameras, rejected or {})
+        if cut_by is None or viewpoints is None:
+            return hull
+        grid = np.full(shape, NOBODY, np.uint8)
+        grid[at[0], at[1], at[2]] = cut_by
+        return replace(hull, cut_by=grid, viewpoints=viewpoints)
 
 
 def lattice_bounds(rig: Rig, voxel_m: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -275,7 +289,7 @@ def carve_silhouettes(silhouettes: Silhouettes, rig: Rig, config: HullConfig) ->
     mended = mend_silhouettes(silhouettes, covered, voxels, config)
     if mended is not silhouettes:
         voxels = evaluate_again(voxels, silhouettes, mended, rig, config.voxel_m, config.band_m)
-    indices, first, second, _ = voxels
+    indices, first, second, who = voxels
     # Ragged masks bite a little from every side. The more the cameras contradict each other, the less may a single
     # one decide; with few cameras two vetoes would leave far too much.
     doubt = 0.0
@@ -286,7 +300,14 @@ def carve_silhouettes(silhouettes: Silhouettes, rig: Rig, config: HullConfig) ->
     if not (distance[near] < 0).any():
         return NoPerson("the silhouettes have no volume in common: is anybody in the carve volume?")
     hull = Hull.from_shell(
-        config.voxel_m, config.band_m, indices[near], distance[near], silhouettes.names, silhouettes.rejected
+        config.voxel_m,
+        config.band_m,
+        indices[near],
+        distance[near],
+        silhouettes.names,
+        silhouettes.rejected,
+        who[near].astype(np.uint8),
+        np.stack([rig.camera(name).T_world_camera[:3, 3] for name in silhouettes.names]).astype(np.float32),
     )
     hull = largest_component(hull)
     if hull.inside_count * (config.voxel_m / 0.02) ** 3 < config.min_voxels:
@@ -312,7 +333,8 @@ def largest_component(hull: Hull) -> Hull:
         near = grown
     keep = near & ((labels == 0) | part)
     sdf = np.where(keep, hull.sdf, np.float32(hull.band_m))
-    return _cropped(Hull(hull.voxel_m, hull.index_min, sdf, hull.band_m, hull.cameras, hull.rejected))
+    cut_by = None if hull.cut_by is None else np.where(keep, hull.cut_by, np.uint8(NOBODY))
+    return _cropped(replace(hull, sdf=sdf, cut_by=cut_by))
 
 
 def _cropped(hull: Hull) -> Hull:
@@ -324,7 +346,9 @@ def _cropped(hull: Hull) -> Hull:
         at = np.flatnonzero(used.any(axis=others))
         slices.append(slice(int(at[0]) - 1, int(at[-1]) + 2))
     i, j, k = (low + cut.start for low, cut in zip(hull.index_min, slices, strict=True))
-    return replace(hull, index_min=(i, j, k), sdf=np.ascontiguousarray(hull.sdf[tuple(slices)]))
+    sdf = np.ascontiguousarray(hull.sdf[tuple(slices)])
+    cut_by = None if hull.cut_by is None else np.ascontiguousarray(hull.cut_by[tuple(slices)])
+    return replace(hull, index_min=(i, j, k), sdf=sdf, cut_by=cut_by)
 
 
 def carve(masks: Mapping[str, NDArray[np.uint8]], rig: Rig, config: HullConfig) -> Hull | NoPerson:

@@ -18,6 +18,7 @@ from limbloc_ros.core.hull import Hull, carve_silhouettes
 from limbloc_ros.core.pose import Pose
 from limbloc_ros.core.silhouettes import measure_silhouettes, pack_cameras
 from limbloc_ros.core.surface import extract_surface
+from limbloc_ros.core.tracker import Tracker
 
 
 class Carver:
@@ -56,7 +57,7 @@ class PoseEstimator:
 
     def __init__(self, config: FitConfig | None = None) -> None:
         self.config = validated(config or FitConfig())
-        self._tracker = engine_robust.Tracker(self.config.seed)
+        self._tracker = Tracker(self.config.seed)
 
     def estimate(self, hull: Hull) -> Pose | NoPerson:
         """Fit the figure to one hull."""

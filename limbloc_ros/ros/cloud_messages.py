@@ -3,7 +3,8 @@
 
 The hull's cloud holds the inside and a thin shell: per voxel its centre (`x y z`, so that RViz shows it as it is), the
 signed distance `sdf` in metres, and what rebuilds the exact grid of the offline path: the lattice indices `i j k`, the
-voxel size and the band in whole micrometres. An empty cloud says that nobody is there.
+voxel size and the band in whole micrometres. `camera` numbers the camera whose silhouette cut the hull there, `vp_x
+vp_y vp_z` is where that camera stands. An empty cloud says that nobody is there.
 """
 
 from __future__ import annotations
@@ -17,22 +18,22 @@ from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import Header
 
 from limbloc_ros.core.errors import InputError
-from limbloc_ros.core.hull import Hull
+from limbloc_ros.core.hull import NOBODY, Hull
 from limbloc_ros.core.surface import Surface
 
 HULL_POINT = np.dtype(
     {
-        "names": ["x", "y", "z", "sdf", "i", "j", "k", "voxel_um", "band_um"],
-        "formats": ["<f4", "<f4", "<f4", "<f4", "<i2", "<i2", "<i2", "<u4", "<u4"],
-        "offsets": [0, 4, 8, 12, 16, 18, 20, 24, 28],
-        "itemsize": 32,
+        "names": ["x", "y", "z", "sdf", "i", "j", "k", "camera", "voxel_um", "band_um", "vp_x", "vp_y", "vp_z"],
+        "formats": ["<f4", "<f4", "<f4", "<f4", "<i2", "<i2", "<i2", "<u2", "<u4", "<u4", "<f4", "<f4", "<f4"],
+        "offsets": [0, 4, 8, 12, 16, 18, 20, 22, 24, 28, 32, 36, 40],
+        "itemsize": 44,
     }
 )
 SURFACE_POINT = np.dtype(
     [(name, "<f4") for name in ("x", "y", "z", "normal_x", "normal_y", "normal_z", "curvature", "geodesic")]
 )
 
-_DATATYPES = {"<f4": PointField.FLOAT32, "<i2": PointField.INT16, "<u4": PointField.UINT32}
+_DATATYPES = {"<f4": PointField.FLOAT32, "<i2": PointField.INT16, "<u2": PointField.UINT16, "<u4": PointField.UINT32}
 
 
 def _fields(point: np.dtype[np.void]) -> list[PointField]:
@@ -95,6 +96,14 @@ def hull_to_cloud(hull: Hull, header: Header) -> PointCloud2:
     points["sdf"] = sdf
     points["voxel_um"] = round(hull.voxel_m * 1e6)
     points["band_um"] = round(hull.band_m * 1e6)
+    points["camera"] = NOBODY
+    if hull.cut_by is not None:
+        cut_by = hull.cut_by[hull.sdf < np.float32(hull.band_m)]
+        known = cut_by < len(hull.viewpoints)
+        points["camera"] = np.where(known, cut_by, NOBODY)
+        viewpoints = hull.viewpoints[np.where(known, cut_by, 0)]
+        for axis in range(3):
+            points["vp_" + "xyz"[axis]] = viewpoints[:, axis]
     return _cloud(points, _HULL_FIELDS, header)
 
 
@@ -137,7 +146,18 @@ def cloud_to_hull(msg: PointCloud2) -> Hull | None:
     if not (np.abs(sdf) < 100.0).all() or not (sdf < np.float32(band_m)).all():
         raise InputError(f"signed distances of a hull's cloud must be finite and below the band of {band_m} m")
     indices = np.stack([points["i"], points["j"], points["k"]], axis=1).astype(np.int32)
-    return Hull.from_shell(voxel_m, band_m, indices, sdf)
+    camera = points["camera"]
+    if (camera > NOBODY).any():
+        raise InputError(f"a hull's cloud numbers cameras up to {NOBODY} (nobody), got {int(camera.max())}")
+    known = camera < NOBODY
+    if not known.any():
+        return Hull.from_shell(voxel_m, band_m, indices, sdf)
+    viewpoints = np.zeros((int(camera[known].max()) + 1, 3), np.float32)
+    for axis in range(3):
+        viewpoints[camera[known], axis] = points["vp_" + "xyz"[axis]][known]
+    if not np.isfinite(viewpoints).all():
+        raise InputError("the places of cameras (vp_x, vp_y, vp_z) in a hull's cloud must be finite")
+    return Hull.from_shell(voxel_m, band_m, indices, sdf, cut_by=camera.astype(np.uint8), viewpoints=viewpoints)
 
 
 def surface_to_cloud(surface: Surface, geodesic: NDArray[np.float64], header: Header) -> PointCloud2:

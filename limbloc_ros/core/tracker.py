@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From frame to frame: the last figure is the first guess (`temporal: true`); when it is lost, the fit starts anew."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from limbloc_ros.core import lm
+from limbloc_ros.core.energy import Evidence, Weights
+from limbloc_ros.core.engine_robust import (
+    Effort,
+    Fit,
+    fit_from_scratch,
+    gather_evidence,
+    make_scene,
+    refine,
+    with_arms,
+)
+from limbloc_ros.core.figure import FigureState
+from limbloc_ros.core.hull import Hull
+from limbloc_ros.core.surface import Surface
+
+
+class Tracker:
+    """Fits frame after frame, each from the last; starts anew when there is no last one or the fit went wrong."""
+
+    #: A cost this much above the usual one, or above this many m^2, is no longer believed ...
+    DOUBT, DOUBTFUL_COST = 1.35, 4.5e-4
+    #: ... but starting anew, which takes as long as many followed frames, is tried only every so many frames: in a
+    #: live room a slow fit makes the next step longer. Arms are checked as often.
+    PATIENCE = 8
+    #: What is searched when starting anew: less than for a frame alone, for the next frames can mend it.
+    SEARCH = Effort(leg_pairs=2, starts=6, survivors=3, repaired=1)
+    #: Other pairs of arms that are tried when arms are checked.
+    ARM_PAIRS = 2
+    #: Surface points that a figure is carried along on.
+    POINTS = 600
+
+    def __init__(self, seed: int, weights: Weights | None = None, effort: Effort | None = None) -> None:
+        self._seed, self._weights, self._effort = seed, weights or Weights(), effort or self.SEARCH
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the last frame."""
+        self._last: FigureState | None = None
+        self._usual_cost = 0.0
+        self._frame = 0
+        self._last_scratch = -self.PATIENCE
+        self._centre = np.zeros(3)
+
+    def follow(self, hull: Hull, surface: Surface) -> Fit | None:
+        """Fit the next frame."""
+        self._frame += 1
+        fit: Fit | None = None
+        centre = surface.points.mean(axis=0)
+        moved, self._centre = centre - self._centre, centre
+        if self._last is not None:
+            evidence = self._evidence(hull, surface)
+            carried = FigureState(self._last.root + moved, self._last.rotations, self._last.shape)
+            result = refine(carried, evidence, self._weights, 10 if np.abs(moved).max() < 0.1 else 20)
+            if self._frame % self.PATIENCE == 0:
+                result = self._check_arms(result, hull, surface)
+            fit = Fit(result.state, result.system, np.inf)
+        if fit is None or self._doubts(fit.system.cost):
+            self._last_scratch = self._frame
+            scratch = fit_from_scratch(hull, surface, self._seed, self._weights, self._effort, None)
+            if scratch is not None and (fit is None or scratch.system.cost < 0.95 * fit.system.cost):
+                fit = scratch
+        if fit is None:
+            self._last = None
+            return None
+        # the usual cost follows slowly, so one odd frame is judged by the calm ones before it
+        fresh = self._last is None or self._usual_cost == 0.0
+        self._usual_cost = fit.system.cost if fresh else 0.9 * self._usual_cost + 0.1 * fit.system.cost
+        self._last = fit.state
+        return fit
+
+    def _evidence(self, hull: Hull, surface: Surface) -> Evidence:
+        return gather_evidence(hull, surface, self.POINTS, np.random.default_rng(self._seed))
+
+    def _doubts(self, cost: float) -> bool:
+        waited = self._frame - self._last_scratch >= self.PATIENCE
+        return waited and (cost > self.DOUBT * self._usual_cost or cost > self.DOUBTFUL_COST)
+
+    def _check_arms(self, result: lm.LmResult[FigureState], hull: Hull, surface: Surface) -> lm.LmResult[FigureState]:
+        """An arm that has slipped into the trunk stays there, for its flesh is explained: look for it elsewhere."""
+        scene = make_scene(hull, surface, self._seed, self._weights, self._effort)
+        best = result
+        for state in with_arms(result.state, scene, self.ARM_PAIRS):
+            settled = refine(state, scene.quick, scene.lenient, 5).state
+            other = refine(settled, self._evidence(hull, surface), self._weights, 8)
+            if other.system.cost < 0.97 * best.system.cost:
+                best = other
+        return best
