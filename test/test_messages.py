@@ -452,3 +452,10 @@ def test_header_keeps_nanoseconds() -> None:
     header: Header = messages.make_header(12_345_678_901_234_567, "f")
     assert (header.stamp.sec, header.stamp.nanosec) == (12_345_678, 901_234_567)
     assert messages.stamp_ns(header) == 12_345_678_901_234_567
+
+
+def test_transforms_of_read_only_arrays() -> None:
+    """Cameras hand out read-only matrices, which the SciPy of Ubuntu 24.04 refuses."""
+    T = np.eye(4)
+    T.setflags(write=False)
+    assert messages.transform_to_message(T, "cam0", messages.make_header(0, "room")).transform.rotation.w == 1.0

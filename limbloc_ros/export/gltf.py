@@ -158,7 +158,7 @@ def _ends(skeleton: Skeleton) -> set[int]:
 
 def _quaternions(rotations: Array) -> Array:
     """[F, 4] x y z w; neighbours on the same half of the sphere, so that players interpolate the short way."""
-    found = Rotation.from_matrix(rotations).as_quat()
+    found = Rotation.from_matrix(np.array(rotations)).as_quat()
     flips = np.where(np.sum(found[1:] * found[:-1], axis=1) < 0, -1.0, 1.0)
     found[1:] *= np.cumprod(flips)[:, None]
     return np.asarray(found)

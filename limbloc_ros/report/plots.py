@@ -58,6 +58,13 @@ def new_figure(width_in: float, height_in: float) -> Figure:
     return figure
 
 
+def legend_above(figure: Figure, handles: Sequence[Any], **options: Any) -> None:
+    """A legend of one line above all axes (`loc="outside upper center"`, which Matplotlib has from 3.7 on)."""
+    engine: Any = figure.get_layout_engine()
+    engine.set(rect=(0, 0, 1, 1 - LEGEND_IN / figure.get_figheight()))
+    figure.legend(handles=handles, loc="upper center", **options)
+
+
 def head_path(run: RunData) -> Figure:
     """Fig. 10: where the head was, in 3D and over time; jumps are marked."""
     path = run.joint_path("head_centre")

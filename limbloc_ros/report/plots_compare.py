@@ -20,6 +20,7 @@ from limbloc_ros.report.plots import (
     ORANGE,
     SIDES,
     STYLE,
+    legend_above,
     new_figure,
     over,
     paired,
@@ -97,7 +98,7 @@ def angles_over_each_other(run: RunData, ours: Mapping[str, Array], theirs: Mapp
             row[0].set_ylabel("degrees")
         handles = [Line2D([], [], color=GREY, linewidth=3.2, label="reference")]
         handles += [Line2D([], [], color=SIDES[side][0], label=f"run, {SIDES[side][2]}") for side in "LR"]
-        figure.legend(handles=handles, loc="outside upper center", ncols=3)
+        legend_above(figure, handles, ncols=3)
         for axes in grid[-1]:
             axes.set_xlabel(unit)
     return figure
@@ -137,5 +138,5 @@ def bland_altman(ours: Mapping[str, Array], theirs: Mapping[str, Array]) -> Figu
             axes.set_xlabel("mean of run and reference (degrees)")
             axes.set_ylabel("run - reference (degrees)")
         handles, labels = grid[0, 0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside upper center", ncols=2, markerscale=1.6)
+        legend_above(figure, handles, labels=labels, ncols=2, markerscale=1.6)
     return figure

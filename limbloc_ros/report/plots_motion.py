@@ -17,6 +17,7 @@ from limbloc_ros.report.plots import (
     SIDES,
     STYLE,
     USUAL_DEG,
+    legend_above,
     new_figure,
     paired,
     sided,
@@ -108,7 +109,7 @@ def ranges_of_motion(run: RunData) -> Figure:
         axes.set_xlabel("degrees")
         handles = [Line2D([], [], color=SIDES[s][0], linewidth=5, label=SIDES[s][2]) for s in ("L", "R", "")]
         handles.append(Line2D([], [], color="#E9ECEF", linewidth=9, label="usual human range"))
-        figure.legend(handles=handles, loc="outside upper center", ncols=4, fontsize=11)
+        legend_above(figure, handles, ncols=4, fontsize=11)
     return figure
 
 

@@ -143,7 +143,7 @@ def _points(points: Array) -> list[Point]:
 
 def transform_to_message(T_parent_child: ArrayLike, child: str, header: Header) -> TransformStamped:
     """[4, 4] pose of `child` in the header's frame."""
-    T = np.asarray(T_parent_child, dtype=np.float64)
+    T = np.array(T_parent_child, dtype=np.float64)  # a copy: SciPy 1.11 (Ubuntu 24.04) takes no read-only arrays
     x, y, z, w = (float(q) for q in Rotation.from_matrix(T[:3, :3]).as_quat())
     msg = TransformStamped(header=header, child_frame_id=child)
     msg.transform.translation = Vector3(x=float(T[0, 3]), y=float(T[1, 3]), z=float(T[2, 3]))

@@ -226,7 +226,7 @@ def write(rig: Rig, path: Path) -> list[str]:
     for camera in rig.cameras:
         write_intrinsics(camera, path / f"{camera.name}.yaml")
         T = camera.T_world_camera
-        q = Rotation.from_matrix(T[:3, :3]).as_quat()
+        q = Rotation.from_matrix(np.array(T[:3, :3])).as_quat()
         transforms += [
             "- header: {frame_id: room}",
             f"  child_frame_id: {camera.name}_optical_frame",
