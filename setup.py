@@ -43,7 +43,8 @@ setup(
         (f"{SHARE}/config", files("config/*")),
     ],
     python_requires=">=3.11",
-    # Both ends were run: the lower one is what Ubuntu 24.04 (Jazzy) has in apt, save for rosbags, which it has not.
+    # Tests of core, bags, nodes and report were run at both ends: the lower one with Python 3.11 and what Ubuntu 24.04
+    # (Jazzy) has in apt, save for rosbags, which it has not; the upper one with Python 3.11 and 3.12.
     install_requires=[
         "numpy>=1.26,<3",
         "scipy>=1.11,<2",

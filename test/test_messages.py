@@ -15,7 +15,7 @@ from visualization_msgs.msg import Marker
 
 from limbloc_ros.core.camera import Camera
 from limbloc_ros.core.errors import InputError, RigError
-from limbloc_ros.core.hull import Hull
+from limbloc_ros.core.hull import NOBODY, Hull
 from limbloc_ros.core.pose import JOINT, JOINT_NAMES, STICK_BONES, Flesh, Pose
 from limbloc_ros.core.surface import extract_surface
 from limbloc_ros.ros import messages
@@ -298,15 +298,26 @@ def ball(voxel_m: float = 0.02, radius_m: float = 0.3, centre: tuple[float, floa
 
 
 def test_bytes_of_one_voxel() -> None:
-    hull = Hull.from_shell(0.02, 0.06, np.array([[10, -3, 50]], np.int32), np.array([-0.25], np.float32))
-    msg = hull_to_cloud(hull, HEADER)
-    assert bytes(msg.data) == struct.pack("<ffffhhhxxII", 0.21, -0.05, 1.01, -0.25, 10, -3, 50, 20_000, 60_000)
-    assert (msg.width, msg.height, msg.point_step, msg.row_step, msg.is_bigendian) == (1, 1, 32, 32, False)
+    indices, sdf = np.array([[10, -3, 50]], np.int32), np.array([-0.25], np.float32)
+    msg = hull_to_cloud(Hull.from_shell(0.02, 0.06, indices, sdf), HEADER)
+    voxel = (0.21, -0.05, 1.01, -0.25, 10, -3, 50)
+    assert bytes(msg.data) == struct.pack("<ffffhhhHIIfff", *voxel, NOBODY, 20_000, 60_000, 0, 0, 0)
+    assert (msg.width, msg.height, msg.point_step, msg.row_step, msg.is_bigendian) == (1, 1, 44, 44, False)
     assert [(f.name, f.offset) for f in msg.fields][:4] == [("x", 0), ("y", 4), ("z", 8), ("sdf", 12)]
     assert [f.datatype for f in msg.fields] == [PointField.FLOAT32] * 4 + [PointField.INT16] * 3 + [
-        PointField.UINT32
-    ] * 2
+        PointField.UINT16
+    ] + [PointField.UINT32] * 2 + [PointField.FLOAT32] * 3
     assert (messages.stamp_ns(msg.header), msg.header.frame_id) == (1_700_000_000_123_456_789, "room")
+
+    cut_by, viewpoints = np.array([1], np.uint8), np.array([[0, 0, 0], [2, -1, 1.5]], np.float32)
+    hull = Hull.from_shell(0.02, 0.06, indices, sdf, cut_by=cut_by, viewpoints=viewpoints)
+    cut = hull_to_cloud(hull, HEADER)
+    assert bytes(cut.data) == struct.pack("<ffffhhhHIIfff", *voxel, 1, 20_000, 60_000, 2, -1, 1.5)
+    back = cloud_to_hull(cut)
+    assert back is not None
+    assert back.cut_by is not None
+    assert back.cut_by.tobytes() == hull.cut_by.tobytes()
+    np.testing.assert_array_equal(back.viewpoints[1], viewpoints[1])
 
 
 @pytest.mark.parametrize("voxel_m", [0.02, 0.1, 0.005, 0.0123])
@@ -342,9 +353,9 @@ def overwritten(offset: int, value: bytes) -> PointCloud2:
 @pytest.mark.parametrize(
     ("msg", "words"),
     [
-        (damaged(width=1_000_000_000), "1000000000x1 points needs 32000000000 bytes"),
+        (damaged(width=1_000_000_000), "1000000000x1 points needs 44000000000 bytes"),
         (damaged(data=array("B", bytes(100))), "got 100"),
-        (damaged(point_step=16), "32 bytes per point"),
+        (damaged(point_step=16), "44 bytes per point"),
         (damaged(is_bigendian=True), "little-endian"),
         (damaged(fields=[PointField(name="rgb")]), "got rgb"),
         (overwritten(12, struct.pack("<f", float("nan"))), "finite"),

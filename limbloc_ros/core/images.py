@@ -103,6 +103,8 @@ def image_to_pixels(msg: RawImage) -> Pixels:
             f"{', '.join(sorted([*_ENCODINGS, *_SEMI_PLANAR]))} (depth and float images cannot be segmented)"
         )
     layout = _ENCODINGS[known]
+    if layout.channels == 2 and width % 2:  # two pixels share their colour; not every OpenCV minds
+        raise InputError(f"a {width}x{height} {encoding} image cannot be converted; expected an even width")
     rows = _rows(msg, height, width * layout.channels * layout.depth().itemsize)
     if layout.depth is np.uint16:
         wide = np.ascontiguousarray(rows).view(">u2" if msg.is_bigendian else "<u2")
