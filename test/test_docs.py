@@ -68,6 +68,27 @@ def test_the_documents_do_have_commands():
         parse("export out/walk --format fbx")
 
 
+def parameters():
+    """All keys of the smart space file as `section.parameter`, from the generated page."""
+    page = (ROOT / "docs" / "parameters.md").read_text(encoding="utf-8")
+    found = set()
+    for section in page.split("\n## ")[1:]:
+        name, _, rows = section.partition("\n")
+        found |= {f"{name}.{row}" for row in re.findall(r"^\| `([\w.]+)` \|", rows, re.MULTILINE)}
+    return found
+
+
+@pytest.mark.parametrize("path", TEXTS, ids=name_of)
+def test_parameters_that_are_named_exist(path):
+    known = parameters()
+    sections = {name.partition(".")[0] for name in known}
+    text = path.read_text(encoding="utf-8")
+    named = re.findall(r"--set ([\w.]+)=", text) + re.findall(r"`([\w.]+)(?:=[\w.]+|: \w+)?`", text)
+    for name in named:
+        if name.partition(".")[0] in sections and name.count(".") and not name.endswith((".py", ".md", ".yaml")):
+            assert name in known, f"{name_of(path)}: {name}"
+
+
 @pytest.mark.parametrize("command", cli.COMMANDS)
 def test_the_examples_of_every_help_parse(command, capsys):
     with pytest.raises(SystemExit):

@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from limbloc_ros.core.pose import JOINT, Array
+from limbloc_ros.export.stick_drawing import side_of
 from limbloc_ros.report.compare import agreement
 from limbloc_ros.report.plots import (
     BLUE,
@@ -57,22 +58,13 @@ def error_over_time_and_by_joint(run: RunData) -> Figure:
         axes.set_title("over time")
         axes.legend(loc="upper right")
         by_joint = halves[1].subplots()
-        boxes = by_joint.boxplot(
-            [column[np.isfinite(column)] for column in millimetres.T],
-            orientation="horizontal",
-            whis=(5, 95),
-            showfliers=False,
-            patch_artist=True,
-            widths=0.62,
-            medianprops={"color": "white", "linewidth": 1.8},
-            whiskerprops={"color": GREY},
-            capprops={"color": GREY},
-        )
-        for name, box in zip(limbs, boxes["boxes"], strict=True):
-            colour, _, _ = SIDES[name[-1] if name.endswith(("_L", "_R")) else ""]
-            box.set(facecolor=colour, edgecolor=colour)
+        for row, (name, column) in enumerate(zip(limbs, millimetres.T, strict=True)):
+            low, start, middle, end, high = np.nanpercentile(column, (5, 25, 50, 75, 95))
+            by_joint.plot((low, high), (row, row), color=GREY, marker="|", markersize=9, zorder=2)
+            by_joint.barh(row, end - start, left=start, height=0.62, color=SIDES[side_of(name)][0], zorder=3)
+            by_joint.plot((middle, middle), (row - 0.31, row + 0.31), color="white", linewidth=1.8, zorder=4)
         by_joint.axvline(CLAIM_MM, color=INK, linewidth=1)
-        by_joint.set_yticks(range(1, len(limbs) + 1), [words(name) for name in limbs], fontsize=10.5)
+        by_joint.set_yticks(range(len(limbs)), [words(name) for name in limbs], fontsize=10.5)
         by_joint.invert_yaxis()
         by_joint.grid(axis="y", visible=False)
         by_joint.set_xlim(0, None)
