@@ -25,6 +25,7 @@ ACTIONS = {
     "import": "read another tool's calibration and make a rig file of it",
     "export": "write a rig file for another tool",
     "calibrate": "calibrate all cameras with a checkerboard or ChArUco board",
+    "check": "find out from footage of a person whether a rig file is right, and which camera is not",
 }
 
 

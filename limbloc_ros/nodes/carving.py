@@ -154,7 +154,7 @@ class CarvingNode(Node):
     def describe(self) -> Sequence[DiagnosticStatus]:
         """The hull, and one entry per camera."""
         problems = self.rig_source.problems if self.rig_source else {}
-        return self.report.statuses(self.synchroniser, self.backlog, problems)
+        return self.report.statuses(self.synchroniser, self.backlog, problems, self.rig)
 
     def _on_hull_config(self, config: HullConfig) -> None:
         self.hull_config = config

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from limbloc_ros.core.camera import Camera
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.uint8]
 
 DPI = 110
 #: Colours that also colour-blind people tell apart, one after the other for the cameras.
@@ -53,11 +54,7 @@ def coverage_picture(
     grid = figure.subplots(rows, columns, squeeze=False)
     limit = float(np.percentile(np.concatenate(errors), 98)) if any(map(len, errors)) else 1.0
     dots = None
-    for i, axes in enumerate(grid.ravel()):
-        axes.set_axis_off()
-        if i >= len(cameras):
-            continue
-        camera = cameras[i]
+    for i, (axes, (_, camera)) in enumerate(_placed(grid, {camera.name: camera for camera in cameras})):
         extent = (-0.5, camera.width - 0.5, camera.height - 0.5, -0.5)
         axes.imshow(np.where(cells[i] > 0, np.nan, 1.0), extent=extent, cmap="Reds", vmin=0, vmax=2.2, aspect="equal")
         axes.plot([extent[0], extent[1], extent[1], extent[0], extent[0]],
@@ -67,6 +64,50 @@ def coverage_picture(
         axes.set_title(f"{camera.name}: {len(errors[i])} corners, {share:.0f} % of the image", fontsize=9)
     if dots is not None:
         figure.colorbar(dots, ax=grid, label="error px", shrink=0.8, aspect=30)
+    return png(figure)
+
+
+def overlay_picture(overlays: Mapping[str, tuple[Mask, Mask]]) -> bytes:
+    """Silhouettes against the hull of all other cameras: white inside, red outside, blue hull only.
+
+    Args:
+        overlays: camera -> small silhouette and projected hull, uint8 0 or 1.
+    """
+    columns = min(4, len(overlays))
+    rows = -(-len(overlays) // columns)
+    figure = Figure(figsize=(3.0 * columns, 2.6 * rows), layout="constrained")
+    for axes, (name, (mask, hull)) in _placed(figure.subplots(rows, columns, squeeze=False), overlays):
+        picture = np.full((*mask.shape, 3), 25, np.uint8)
+        picture[hull != 0] = (60, 110, 200)
+        picture[(mask != 0) & (hull != 0)] = 255
+        picture[(mask != 0) & (hull == 0)] = (225, 40, 30)
+        axes.imshow(picture)
+        axes.set_title(name, fontsize=9)
+    return png(figure)
+
+
+def _placed(grid: Any, items: Mapping[str, Any]) -> Iterator[tuple[Any, tuple[str, Any]]]:
+    """Axes and items; axes without an item stay empty."""
+    flat = list(grid.ravel())
+    for axes in flat:
+        axes.set_axis_off()
+    yield from zip(flat, items.items(), strict=False)
+
+
+def pair_picture(table: Array, names: Sequence[str]) -> bytes:
+    """A matrix [C, C] of how much each pair of cameras contradicts itself, as shares."""
+    size = 2.2 + 0.55 * len(names)
+    figure = Figure(figsize=(size + 0.6, size), layout="constrained")
+    axes = figure.add_subplot()
+    top = max(0.1, float(np.nanmax(table)) if np.isfinite(table).any() else 0.1)
+    axes.imshow(100 * table, cmap="Purples", vmin=0, vmax=100 * top)
+    for (i, j), value in np.ndenumerate(table):
+        if np.isfinite(value):
+            axes.text(j, i, f"{100 * value:.0f}", ha="center", va="center", fontsize=8,
+                      color="white" if value > 0.6 * top else "black")  # fmt: skip
+    axes.set_xticks(range(len(names)), names, rotation=45, ha="right", fontsize=8)
+    axes.set_yticks(range(len(names)), names, fontsize=8)
+    axes.set_title("unexplained foreground of pairs, %", fontsize=9)
     return png(figure)
 
 

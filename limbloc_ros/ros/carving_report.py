@@ -9,10 +9,12 @@ import cv2
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.node import Node
 
+from limbloc_ros.core.camera import Rig
 from limbloc_ros.core.errors import NoPerson
 from limbloc_ros.core.hull import Hull
 from limbloc_ros.core.images import Pixels
 from limbloc_ros.core.synchroniser import FrameSet, StampSynchroniser, SyncCounters
+from limbloc_ros.rig.watch import ConsistencyWatch
 from limbloc_ros.ros.backlog import Backlog
 from limbloc_ros.ros.health import Meter
 from limbloc_ros.ros.messages import ERROR, OK, WARN, make_status
@@ -38,6 +40,9 @@ class CarvingReport:
         self._last: FrameSet[Pixels] | None = None
         self._outcome: Hull | NoPerson | None = None
         self._carve_ms = float("nan")
+        self._watch: ConsistencyWatch | None = None
+        self._compared: FrameSet[Pixels] | None = None
+        self._suspect: tuple[str, str] | None = None
 
     def mask(self, camera: str, mask: Pixels, latency_s: float) -> None:
         """A usable mask came."""
@@ -54,6 +59,7 @@ class CarvingReport:
         synchroniser: StampSynchroniser[Pixels] | None,
         backlog: Backlog[FrameSet[Pixels]],
         problems: Mapping[str, str],
+        rig: Rig | None = None,
     ) -> Sequence[DiagnosticStatus]:
         """One entry for the hull, and one per camera.
 
@@ -61,12 +67,24 @@ class CarvingReport:
             synchroniser: None while there is no rig.
             backlog: finished sets that wait to be carved.
             problems: camera -> why the rig lacks it.
+            rig: with it, each call also looks whether the cameras agree about the last set.
         """
+        self._compare(rig)
         counters = synchroniser.counters if synchroniser else SyncCounters()
         return [
             self._hull(synchroniser, counters, backlog, problems),
             *(self._camera(c, counters, problems) for c in self._topics),
         ]
+
+    def _compare(self, rig: Rig | None) -> None:
+        """Find out whether a camera has been bumped; a hull that vanished because of one is looked at too."""
+        if rig is None or self._last is None or self._last is self._compared:
+            return
+        if self._watch is None or self._watch.rig is not rig:
+            self._watch = ConsistencyWatch(rig)
+        self._compared = self._last
+        self._watch.look(self._last.items)
+        self._suspect = self._watch.suspect()
 
     def _hull(
         self,
@@ -115,6 +133,8 @@ class CarvingReport:
             level, message = ERROR, self._why_silent(camera, meter.silence_s)
         elif camera in rejected:
             level, message = WARN, f"not used: {rejected[camera]}"
+        elif self._suspect is not None and self._suspect[0] == camera:
+            level, message = WARN, self._suspect[1]
         values = {
             "rate_hz": meter.rate_hz,
             "latency_ms": meter.latency_ms,

@@ -1,0 +1,234 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Do the cameras of a rig agree about a person? Silhouettes are carved coarsely and compared with what is left.
+
+A hull lies inside every silhouette by construction, so what tells is foreground that no part of the hull explains:
+with a true rig and clean masks there is none. A camera that is out of place cuts pieces off the hull, and then *all*
+cameras show unexplained foreground; but without the guilty one, the others agree again. That is what is measured:
+the contradiction of all cameras, and of the rest without each of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from limbloc_ros.core.camera import Camera, Rig
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.uint8]
+
+#: Images are looked at no wider or higher than this, px.
+LOW_PX = 240
+#: At most so many voxels.
+MOST_VOXELS = 90_000
+#: A camera whose foreground is smaller than this share of the image, or larger, says nothing.
+FILL = (0.001, 0.6)
+
+
+@dataclass(frozen=True)
+class LowView:
+    """A camera with small images.
+
+    Attributes:
+        camera: with K scaled to the small image.
+        scale: small over large, px.
+        ignored: uint8 [h, w] 1 where the image means nothing, or None.
+    """
+
+    camera: Camera
+    scale: float
+    ignored: Mask | None
+
+    def shrink(self, mask: Mask) -> Mask:
+        """A mask [height, width] as a small one of 0 and 1; regions to ignore are 0."""
+        size = (self.camera.width, self.camera.height)
+        small = cv2.resize((mask != 0).astype(np.float32), size, interpolation=cv2.INTER_AREA) >= 0.5
+        if self.ignored is not None:
+            small &= self.ignored == 0
+        return np.asarray(small, dtype=np.uint8)
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Voxels of a box of space and where each camera sees them.
+
+    Attributes:
+        views: of the rig's cameras, in their order.
+        points: [V, 3] voxel centres, in the rig's unit.
+        voxel: their edge.
+        pixels: int32 [C, V] index into each small image, -1 where the camera does not see the voxel.
+        reach: [C] px: half a voxel's size in each small image where it is largest.
+    """
+
+    views: tuple[LowView, ...]
+    points: Array
+    voxel: float
+    pixels: NDArray[np.int32]
+    reach: NDArray[np.int64]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The cameras' names."""
+        return tuple(view.camera.name for view in self.views)
+
+
+@dataclass(frozen=True)
+class Scores:
+    """How the cameras agree in one frame or in several.
+
+    Attributes:
+        names: of the cameras with a usable mask.
+        together: mean share of unexplained foreground with the hull of all of them; NaN with fewer than two.
+        without: [C] the same of the others with the hull of the others, without each camera.
+        unexplained: [C] share of each camera's foreground that the hull of all does not explain.
+        alone: [C] share of each camera's foreground that lies outside the hull of all others.
+    """
+
+    names: tuple[str, ...]
+    together: float
+    without: Array
+    unexplained: Array
+    alone: Array
+
+    @property
+    def blame(self) -> Array:
+        """[C] by how much the contradiction falls when a camera is left out."""
+        return np.asarray(self.together - self.without)
+
+
+def low_view(camera: Camera) -> LowView:
+    """A camera with small images."""
+    scale = min(1.0, LOW_PX / max(camera.width, camera.height))
+    width, height = max(2, round(scale * camera.width)), max(2, round(scale * camera.height))
+    A = np.array([[width / camera.width, 0, 0.0], [0, height / camera.height, 0.0], [0, 0, 1]])
+    A[:2, 2] = 0.5 * np.diag(A)[:2] - 0.5
+    ignored = camera.ignored_pixels()
+    if ignored is not None:
+        ignored = np.asarray(cv2.resize(ignored, (width, height), interpolation=cv2.INTER_NEAREST), dtype=np.uint8)
+    small = replace(camera, width=width, height=height, K=A @ camera.K, ignore=())
+    return LowView(small, scale, ignored)
+
+
+def look_up(camera: Camera, points: Array) -> NDArray[np.int32]:
+    """[V] index of each point's pixel in the flattened image, -1 where it is not seen."""
+    uv, depth = camera.world_to_image(points)
+    x, y = np.rint(np.nan_to_num(uv, nan=-1.0, posinf=-1.0, neginf=-1.0)).clip(-1e6, 1e6).astype(np.int64).T
+    # Distortion folds far points back into the image: only those near it without distortion can be in it.
+    plain = (points @ camera.T_camera_world[:3, :3].T + camera.T_camera_world[:3, 3])[:, :2] / np.where(
+        depth > 0, depth, np.inf
+    )[:, None]
+    limit = 1.4 * np.array([camera.width, camera.height]) / camera.K[[0, 1], [0, 1]]
+    seen = (depth > 0) & (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
+    seen &= (np.abs(plain) < limit).all(axis=1)
+    return np.where(seen, y * camera.width + x, -1).astype(np.int32)
+
+
+def make_grid(rig: Rig, low: Array | None = None, high: Array | None = None, most: int = MOST_VOXELS) -> Grid:
+    """Voxels of the carve volume, or of the box from low to high, as fine as `most` voxels allow."""
+    low = rig.volume_min if low is None else np.asarray(low, dtype=np.float64)
+    high = rig.volume_max if high is None else np.asarray(high, dtype=np.float64)
+    voxel = float(np.cbrt(np.prod(high - low) / most))
+    axes = [np.arange(low[a] + 0.5 * voxel, high[a], voxel) for a in range(3)]
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    views = tuple(low_view(camera) for camera in rig.cameras)
+    middle = (low + high) / 2
+    pixels = np.stack([look_up(view.camera, points) for view in views])
+    reach = []
+    for view in views:
+        distance = max(float(np.linalg.norm(view.camera.T_world_camera[:3, 3] - middle)), 1e-9)
+        reach.append(int(np.ceil(0.87 * voxel * view.camera.K[0, 0] / distance)))
+    return Grid(views, points, voxel, pixels, np.array(reach))
+
+
+def shrink_masks(views: Sequence[LowView], masks: Mapping[str, Mask]) -> dict[int, Mask]:
+    """Camera index -> small mask, of those whose mask says something."""
+    out = {}
+    for c, view in enumerate(views):
+        mask = masks.get(view.camera.name)
+        if mask is None:
+            continue
+        small = view.shrink(mask)
+        if FILL[0] * small.size <= int(small.sum()) <= FILL[1] * small.size:
+            out[c] = small
+    return out
+
+
+def inside(grid: Grid, camera: int, mask: Mask, chosen: NDArray[np.int64] | None = None) -> NDArray[np.bool_]:
+    """[V] voxels that the camera does not deny: on its foreground, unseen by it, or where it is to be ignored."""
+    pixels = grid.pixels[camera] if chosen is None else grid.pixels[camera][chosen]
+    ignored = grid.views[camera].ignored
+    open_mask = mask if ignored is None else mask | ignored
+    return np.asarray((open_mask.ravel()[pixels] != 0) | (pixels < 0))
+
+
+def cover(grid: Grid, camera: int, voxels: NDArray[np.int64]) -> Mask:
+    """Pixels (0 or 1) of a small image that voxels project to, with their size."""
+    camera_ = grid.views[camera].camera
+    pixels = grid.pixels[camera][voxels]
+    return splat(pixels[pixels >= 0], (camera_.height, camera_.width), int(grid.reach[camera]))
+
+
+def splat(pixels: NDArray[np.int32], shape: tuple[int, int], reach: int) -> Mask:
+    """An image with these pixels and what is within `reach` of them set to 1."""
+    image = np.zeros(shape, np.uint8)
+    image.ravel()[pixels] = 1
+    size = 2 * reach + 1
+    return np.asarray(cv2.dilate(image, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))), dtype=np.uint8)
+
+
+def unexplained_share(mask: Mask, covered: Mask) -> float:
+    """Share of the foreground, but its rim, that is not covered; 0 where there is no inner foreground."""
+    core = cv2.erode(mask, np.ones((3, 3), np.uint8))
+    total = int(core.sum())
+    return float((core & (1 - covered)).sum() / total) if total else 0.0
+
+
+def score(grid: Grid, masks: Mapping[int, Mask]) -> Scores:
+    """How the cameras agree in one frame.
+
+    Args:
+        grid: the voxels.
+        masks: of `shrink_masks`: camera index -> small mask.
+    """
+    cameras = list(masks)
+    names = tuple(grid.names[c] for c in cameras)
+    if len(cameras) < 2:
+        nothing = np.full(len(cameras), np.nan)
+        return Scores(names, float("nan"), nothing, nothing, nothing)
+    kept = np.stack([inside(grid, c, masks[c]) for c in cameras])
+    seen = np.stack([grid.pixels[c] >= 0 for c in cameras])
+    # As in carving: what most cameras do not see is nobody's hull.
+    enough = seen.sum(axis=0) > max(1, len(cameras) // 2)
+    denials = (~kept).sum(axis=0)
+    full = np.flatnonzero((denials == 0) & enough)
+    unexplained = np.array([unexplained_share(masks[c], cover(grid, c, full)) for c in cameras])
+    without, alone = np.full(len(cameras), np.nan), np.full(len(cameras), np.nan)
+    for i, c in enumerate(cameras):
+        rest = np.flatnonzero((denials - ~kept[i] == 0) & enough)
+        alone[i] = unexplained_share(masks[c], cover(grid, c, rest))
+        others = [unexplained_share(masks[k], cover(grid, k, rest)) for k in cameras if k != c]
+        if len(others) > 1:  # two cameras alone nearly always agree
+            without[i] = float(np.mean(others))
+    return Scores(names, float(unexplained.mean()), without, unexplained, alone)
+
+
+def mean_scores(scores: Collection[Scores], names: Sequence[str]) -> Scores:
+    """The mean over frames, for the cameras `names`; NaN for those that no frame has."""
+    rows = {key: np.full((len(scores), len(names)), np.nan) for key in ("without", "unexplained", "alone")}
+    for f, one in enumerate(scores):
+        at = [names.index(name) for name in one.names]
+        for key, row in rows.items():
+            row[f, at] = getattr(one, key)
+    together = np.array([one.together for one in scores])
+
+    def mean(values: Array) -> Array:
+        good = np.isfinite(values)
+        return np.asarray(
+            np.where(good, values, 0.0).sum(axis=0) / np.where(good.any(axis=0), good.sum(axis=0), np.nan)
+        )
+
+    return Scores(tuple(names), float(mean(together)), *(mean(rows[k]) for k in ("without", "unexplained", "alone")))
