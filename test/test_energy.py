@@ -11,6 +11,7 @@ from limbloc_ros.core import energy, figure
 from limbloc_ros.core.energy import Evidence, Weights
 from limbloc_ros.core.figure import BONE, FigureState, place
 from limbloc_ros.core.hull import Hull
+from limbloc_ros.core.pose import Flesh
 
 NOTHING = Weights(surface=0.0, inclusion=0.0, penetration=0.0, posture=0.0, limits=0.0, spine=0.0, proportions=0.0)
 VOXEL = 0.02
@@ -47,11 +48,21 @@ def evidence_of(state, rng, count=200):
     points, normals = surface_points(state, count, rng)
     weights = rng.uniform(0.5, 1.5, len(points))
     sdf, origin = flesh_grid(state)
-    return Evidence(points, normals, weights / weights.sum(), sdf, origin, VOXEL)
+    return Evidence(points, normals, np.zeros_like(points), weights / weights.sum(), sdf, origin, VOXEL)
 
 
 def size(state):
     return 3 + figure.N_DOF + len(state.shape)
+
+
+def ray_distances(points, rays, placed):
+    """Signed distance [Q] of rays (points where they are zero) to the flesh: that of circles, seen along the ray."""
+    out = np.empty(len(points))
+    for q, (point, ray) in enumerate(zip(points, rays, strict=True)):
+        flat = placed.spheres - np.outer((placed.spheres - point) @ ray, ray)
+        flesh = Flesh(flat, placed.radii, figure.PART_SPHERES, figure.PART_NAMES)
+        out[q] = figure.flesh_distance(point[None], flesh)[0][0]
+    return out
 
 
 @pytest.fixture(scope="module")
@@ -63,6 +74,22 @@ def case():
     step[:3] *= 0.3
     step[3 + figure.N_DOF] *= 0.3
     return truth, evidence_of(truth, rng), truth.moved(step)
+
+
+@pytest.fixture(scope="module")
+def seen(case):
+    """The same case, but three of four points are asked for along some ray only that touches the skin there.
+
+    A ray right through three spheres of a trunk, seen as a triangle, is as deep inside as they are thick, and how their
+    thickness changes across the triangle is left out of the derivative; so there the point itself is asked for.
+    """
+    truth, evidence, state = case
+    rays = np.cross(evidence.normals, np.random.default_rng(5).normal(size=evidence.points.shape))
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    rays[::4] = 0.0
+    rays[ray_distances(evidence.points, rays, place(state)) < -0.03] = 0.0
+    assert rays.any(axis=1).sum() > 100
+    return truth, dataclasses.replace(evidence, rays=rays), state
 
 
 def finite_difference(state, evidence, weights, h=1e-6):
@@ -99,16 +126,25 @@ def test_gradient_of_a_term(case, name):
     np.testing.assert_allclose(2 * system.gradient, numeric, atol=1e-6 * np.abs(numeric).max())
 
 
+@pytest.mark.parametrize("name", ["surface", "gated surface"])
+def test_gradient_of_the_surface_term_along_rays(seen, case, name):
+    _, evidence, state = seen
+    system = energy.system(state, evidence, TERMS[name])
+    assert system.cost > 0
+    assert system.cost != pytest.approx(energy.system(state, case[1], TERMS[name]).cost, rel=0.01)
+    numeric = finite_difference(state, evidence, TERMS[name])
+    np.testing.assert_allclose(2 * system.gradient, numeric, atol=1e-6 * np.abs(numeric).max())
+
+
 def entangled():
     """Someone whose arms and legs run through each other."""
     rng = np.random.default_rng(1)
-    placeholder = Evidence(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), AIR, np.zeros(3), VOXEL)
     people = [figure_poses.random_state(rng) for _ in range(30)]
-    return max(people, key=lambda state: energy.system(state, placeholder, TERMS["penetration"]).cost)
+    return max(people, key=lambda state: energy.system(state, BARE, TERMS["penetration"]).cost)
 
 
 AIR = np.ones((3, 3, 3), np.float32)
-BARE = Evidence(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), AIR, np.zeros(3), VOXEL)
+BARE = Evidence(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), AIR, np.zeros(3), VOXEL)
 
 
 @pytest.mark.parametrize("name", ["posture", "limits"])
@@ -157,12 +193,13 @@ def test_matrix_is_symmetric_and_positive(case):
         assert np.linalg.eigvalsh(matrix).min() >= -1e-9 * np.abs(matrix).max()
 
 
-def test_matrix_of_the_surface_term_against_its_residuals(case):
-    _, evidence, state = case
+@pytest.mark.parametrize("along", ["points", "rays"])
+def test_matrix_of_the_surface_term_against_its_residuals(case, seen, along):
+    _, evidence, state = case if along == "points" else seen
     wide = only(surface=1.0, normal_gate_m=0.0, surface_width_m=1e6, surface_inside=3.0)  # in effect no robustness
 
     def residuals(step):
-        return figure.flesh_distance(evidence.points, place(state.moved(step)).flesh())[0]
+        return ray_distances(evidence.points, evidence.rays, place(state.moved(step)))
 
     h = 1e-6
     J = np.stack([(residuals(h * e) - residuals(-h * e)) / (2 * h) for e in np.eye(size(state))], axis=1)
@@ -173,6 +210,32 @@ def test_matrix_of_the_surface_term_against_its_residuals(case):
     assert system.cost == pytest.approx((weight * d * d).sum(), rel=1e-6)
     matrix = J.T @ (weight[:, None] * J)
     np.testing.assert_allclose(system.matrix, matrix, atol=1e-6 * np.abs(matrix).max())
+    np.testing.assert_allclose(system.gradient, J.T @ (weight * d), atol=1e-6 * np.abs(J.T @ (weight * d)).max())
+
+
+def test_blocks_are_gathered_as_a_dense_product():
+    """Some parts without evidence, spheres that repeat within a part, parameters that move no part."""
+    rng = np.random.default_rng(6)
+    spheres, parameters = 9, 14
+    parts = np.array([[0, 1, 2], [3, 4, 4], [5, 5, 5], [6, 7, 8], [2, 3, 6]])
+    J = rng.normal(size=(spheres, 4, parameters)) * (rng.random((spheres, 1, parameters)) < 0.4)
+    J[:, :, [0, 5, 13]] = 0.0
+    J[2, :, 7] = [0.0, 0.0, 0.0, 0.3]  # only its radius changes
+    half = rng.normal(size=(len(parts), 12, 12))
+    full = half @ half.transpose(0, 2, 1)
+    full[3] = 0.0
+    slopes = rng.normal(size=(len(parts), 12)) * full.any(axis=(1, 2))[:, None]
+    dense, gradient = np.zeros((parameters, parameters)), np.zeros(parameters)
+    for part, block, slope in zip(parts, full, slopes, strict=True):
+        rows = J[part].reshape(12, parameters)
+        dense += rows.T @ block @ rows
+        gradient += rows.T @ slope
+    A, g = np.zeros((parameters, parameters)), np.zeros(parameters)
+    energy.kernels.gather(np.triu(full), slopes, parts, J, A, g)  # the terms fill the upper triangle only
+    np.testing.assert_allclose(A, dense, atol=1e-12 * np.abs(dense).max())
+    np.testing.assert_allclose(g, gradient, atol=1e-12 * np.abs(gradient).max())
+    assert np.abs(dense).max() > 1
+    np.testing.assert_array_equal(A, A.T)
 
 
 # what the terms mean
@@ -184,13 +247,14 @@ def test_the_true_figure_explains_its_own_surface(case):
     assert energy.system(state, evidence, only(surface=1.0)).cost > 1e-4
 
 
-def surface_cost(point, normal, gate=0.0, inside=2.0, width=0.1):
+def surface_cost(point, normal, gate=0.0, inside=2.0, width=0.1, ray=(0.0, 0.0, 0.0)):
     spheres, radii = np.array([[0.0, 0.0, 0.0], [0.5, 0.0, 0.0]]), np.array([0.1, 0.1])
     parts = np.array([[0, 0, 0], [1, 1, 1]])
     blocks, slopes = np.zeros((2, 12, 12)), np.zeros((2, 12))
     cost = energy.kernels.surface_term(
-        np.array([point]), np.array([normal]), np.ones(1), parts, spheres, radii, width, gate, inside, blocks, slopes
-    )
+        np.array([point]), np.array([normal]), np.array([ray]), np.ones(1),
+        parts, spheres, radii, width, gate, inside, blocks, slopes,
+    )  # fmt: skip
     return cost, slopes
 
 
@@ -213,6 +277,48 @@ def test_surface_term_worked_by_hand():
     assert cost == pytest.approx(geman_mcclure(0.14))
     # nothing costs more than the square of the width
     assert surface_cost([90.0, 0.0, 0.0], ahead)[0] == pytest.approx(0.01, rel=1e-4)
+
+
+def test_a_ball_beside_a_ray_worked_by_hand():
+    """Balls of 10 cm at x = 0 and 0.5; rays along y, 13 cm off the first: 3 cm are missing, wherever the point is."""
+    ahead, back, y = [1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], (0.0, 1.0, 0.0)
+    for far in (-4.0, 0.0, 0.2, 50.0):
+        cost, slopes = surface_cost([0.13, far, 0.0], ahead, ray=y)
+        assert cost == pytest.approx(geman_mcclure(0.03))
+        pull = 0.03 / (1 + 0.09) ** 2
+        # only across the ray: nothing pulls the ball along it
+        np.testing.assert_allclose(slopes[0][:4], [-pull, 0.0, 0.0, -pull], atol=1e-12)
+        assert not slopes[1].any()
+        assert surface_cost([0.13, far, 0.0], ahead, ray=(0.0, -1.0, 0.0))[0] == pytest.approx(cost)
+        assert surface_cost([0.07, far, 0.0], ahead, ray=y)[0] == pytest.approx(2 * geman_mcclure(0.03))
+    # without the ray the point itself is asked for
+    far_off = np.hypot(0.13, 0.2) - 0.1
+    assert surface_cost([0.13, 0.2, 0.0], ahead)[0] == pytest.approx(geman_mcclure(far_off))
+    # 14 cm from the first ball, which looks the other way, and 16 cm from the second, as without rays
+    assert surface_cost([0.24, 7.0, 0.0], back, ray=y)[0] == pytest.approx(geman_mcclure(0.14))
+    cost, slopes = surface_cost([0.24, 7.0, 0.0], back, gate=0.03, ray=y)
+    assert cost == pytest.approx(geman_mcclure(0.16))
+    assert not slopes[0].any()
+    # along x both balls are one behind the other: the ray runs 4 cm beside their centres
+    assert surface_cost([9.0, 0.0, 0.14], [0.0, 0.0, 1.0], ray=(1.0, 0.0, 0.0))[0] == pytest.approx(geman_mcclure(0.04))
+
+
+def test_the_true_figure_explains_rays_that_touch_it(case):
+    """A tangent to the skin is explained; one moved outward is not."""
+    truth, evidence, _ = case
+    rng = np.random.default_rng(8)
+    rays = np.cross(evidence.normals, rng.normal(size=evidence.normals.shape))
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    outlines = np.abs(ray_distances(evidence.points, rays, place(truth))) < 1e-9  # not through other flesh
+    assert outlines.sum() > 20
+    weights = outlines / outlines.sum()
+    touching = dataclasses.replace(evidence, rays=rays, point_weights=weights)
+    assert energy.system(truth, touching, only(surface=1.0)).cost < 1e-12
+    slid = dataclasses.replace(touching, points=touching.points + 5.0 * rays)
+    assert energy.system(truth, slid, only(surface=1.0)).cost < 1e-12
+    lifted = dataclasses.replace(touching, points=touching.points + 0.02 * touching.normals)
+    expected = geman_mcclure(0.02, Weights().surface_width_m)
+    assert energy.system(truth, lifted, only(surface=1.0, normal_gate_m=0.0)).cost == pytest.approx(expected, rel=0.1)
 
 
 def inclusion_cost(x, radius, slack=0.01):
