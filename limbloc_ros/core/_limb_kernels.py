@@ -77,8 +77,11 @@ def explained_grid(sdf: Any, origin: Any, voxel: float, stride: int, parts: Any,
                     bx = x - bounds[p, 0]
                     by = y - bounds[p, 1]
                     bz = z - bounds[p, 2]
-                    if bx * bx + by * by + bz * bz > bounds[p, 3] * bounds[p, 3]:
+                    reach = bounds[p, 3] + worst
+                    if reach <= 0.0 or bx * bx + by * by + bz * bz > reach * reach:
                         continue
+                    if worst < -0.05:
+                        break
                     worst = min(worst, part_distance(x, y, z, parts[p], spheres, radii, w))
                 out[i, j, k] = min(-worst / 0.05, 1.0)
     return out

@@ -103,6 +103,14 @@ def torso_from_pairs(
             length = math.sqrt(dx * dx + dy * dy + dz * dz)
             if length < shortest or length > longest:
                 continue
+            outside = False
+            for t in (0.3, 0.5, 0.7):  # a bent trunk's chord may leave the hull a little
+                x = pelvis_seeds[a, 0] + t * dx
+                y = pelvis_seeds[a, 1] + t * dy
+                z = pelvis_seeds[a, 2] + t * dz
+                outside |= depth_at(sdf, origin, voxel, x, y, z) > 0.03
+            if outside:
+                continue
             for c in range(len(bends)):
                 ax = axis_tip[c, 0] - axis_base[c, 0]
                 ay = axis_tip[c, 1] - axis_base[c, 1]

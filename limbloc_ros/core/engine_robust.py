@@ -54,10 +54,13 @@ class Effort:
 #: Tried when the energy (m^2) stays above DOUBTFUL_COST.
 HARDER = Effort(torsos=14, leg_pairs=4, starts=24, survivors=8, repaired=4)
 DOUBTFUL_COST = 5e-4
+#: Below this energy (m^2) only the best candidate's limbs are looked for again.
+EASY_COST = 2.2e-4
 
 #: Candidates for one limb.
 CANDIDATES = 80
 
+ARM_BONES = np.array([figure.BONE[f"{name}_{side}"] for side in "LR" for name in ARM.bones])
 _LIMB_BASES = ("upper_arm", "forearm", "hand")
 BODY_PARTS = np.array([p for p, name in enumerate(figure.PART_NAMES) if not name.startswith(_LIMB_BASES)])
 
@@ -220,23 +223,28 @@ def _fit_from_torsos(torsos: list[FigureState], scene: Scene, effort: Effort) ->
     tried = [refine(state, quick, lenient, first) for state in _cheapest(starts, scene, effort.starts)]
     tried = [refine(r.state, quick, lenient, second) for r in _best(tried, effort.survivors)]
     # With the trunk in place and sizes adapted, limbs are looked for once more.
-    for candidate in _best(tried, effort.repaired):
+    best = _best(tried, effort.repaired)
+    for candidate in best[:1] if best[0].system.cost < EASY_COST else best:
         others = with_arms(candidate.state, scene, effort.arm_repairs)
         others += _cheapest(_with_limbs([candidate.state], scene, effort.leg_pairs), scene, effort.leg_repairs)
         tried += [refine(state, quick, lenient, repair) for state in others]
     tried = [refine(r.state, quick, scene.weights, strict) for r in _best(tried, effort.strict)]
     finals = [refine(r.state, scene.full, scene.weights, final) for r in _best(tried, effort.finalists)]
-    best = _best(finals, effort.finalists)
-    return Fit(best[0].state, best[0].system, best[-1].system.cost)
+    finals = _best(finals, effort.finalists)
+    return Fit(finals[0].state, finals[0].system, finals[-1].system.cost)
 
 
 def _with_limbs(states: list[FigureState], scene: Scene, leg_pairs: int) -> list[FigureState]:
-    return [
-        limbed
-        for state in states
-        for standing in with_legs(state, scene, leg_pairs)
-        for limbed in with_arms(standing, scene, 1)
-    ]
+    """Each state with several pairs of legs, and with the arms that go with the best of them."""
+    out = []
+    for state in states:
+        standing = with_legs(state, scene, leg_pairs)
+        armed = with_arms(standing[0], scene, 1)[0]
+        for legged in standing:
+            rotations = legged.rotations.copy()
+            rotations[ARM_BONES] = armed.rotations[ARM_BONES]
+            out.append(FigureState(legged.root, rotations, legged.shape))
+    return out
 
 
 def _cheapest(states: list[FigureState], scene: Scene, keep: int) -> list[FigureState]:
