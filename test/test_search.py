@@ -5,61 +5,21 @@ Such hulls say nothing of real people (see test_engine_robust.py); they say whet
 """
 
 import math
-from types import SimpleNamespace
 
 import figure_poses
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
+from flesh_hulls import POSTURES, VOXEL, hull_where, person_in
 
-from limbloc_ros.core import figure, search
-from limbloc_ros.core.figure import BONE, FigureState, place
-from limbloc_ros.core.hull import Hull
-from limbloc_ros.core.search import ARM, LEG, Limbs, Medial, kernels, limb_kernels
-
-VOXEL, BAND = 0.02, 0.06
-
-
-def hull_where(inside_m, low, high):
-    """The hull of a signed distance function between two corners."""
-    a, b = np.floor(np.array(low) / VOXEL).astype(int), np.ceil(np.array(high) / VOXEL).astype(int)
-    index = np.stack(np.meshgrid(*(np.arange(*ab) for ab in zip(a, b, strict=True)), indexing="ij"), axis=-1)
-    d = inside_m((index.reshape(-1, 3) + 0.5) * VOXEL).reshape(index.shape[:3])
-    return Hull(VOXEL, tuple(a.tolist()), np.minimum(d, BAND).astype(np.float32), BAND)
-
-
-def flesh_hull(state):
-    """The hull that ideal cameras would carve of a figure."""
-    placed = place(state)
-    flesh = placed.flesh()
-    low, high = placed.spheres.min(axis=0) - 0.16, placed.spheres.max(axis=0) + 0.16
-    return hull_where(lambda points: figure.flesh_distance(points, flesh)[0], low, high)
-
-
-POSTURES = {
-    "arms out": {"shoulder_L_abduction": 70, "shoulder_R_abduction": 70, "hip_L_abduction": 12, "hip_R_abduction": 12},
-    "striding": {
-        "shoulder_L_flexion": 60,
-        "elbow_L_flexion": 60,
-        "shoulder_R_abduction": 40,
-        "elbow_R_flexion": 30,
-        "hip_L_flexion": 35,
-        "knee_L_flexion": 40,
-        "hip_R_flexion": -15,
-    },
-}
+from limbloc_ros.core import search
+from limbloc_ros.core.figure import BONE, place
+from limbloc_ros.core.search import ARM, LEG, Medial, kernels, limb_kernels
 
 
 @pytest.fixture(scope="module", params=POSTURES)
 def person(request):
     """A posed figure somewhere in the room, its hull and the hull's medial axis."""
-    posed = figure_poses.posed(POSTURES[request.param])
-    turn = Rotation.from_euler("z", 50, degrees=True).as_matrix()
-    rotations = posed.rotations.copy()
-    rotations[0] = turn @ rotations[0]
-    state = FigureState(np.array([0.4, -0.7, 1.0]), rotations, posed.shape)
-    hull = flesh_hull(state)
-    return SimpleNamespace(state=state, placed=place(state), hull=hull, medial=Medial.of(hull))
+    return person_in(request.param)
 
 
 # medial axis
@@ -139,67 +99,6 @@ def test_points_are_spread_out_greedily():
     assert len(kernels.spread_out(points[:0], order[:0], 0.25, 5)) == 0
 
 
-def bits_of(flags):
-    padded = np.zeros(-(-len(flags) // 64) * 64, np.uint8)
-    padded[: len(flags)] = flags
-    return np.packbits(padded, bitorder="little").view(np.uint64)
-
-
-def test_popcount():
-    rng = np.random.default_rng(2)
-    values = [0, 1, 2**63, 2**64 - 1, 0x5555555555555555, *rng.integers(0, 2**63, 50).tolist()]
-    # within best_pairs: one pair, nothing taken
-    left = np.array([[0.0, 0, 0, 0, 0, 0, 0]])
-    for value in values:
-        bits = np.array([[value]], np.uint64)
-        pairs = limb_kernels.best_pairs(left, left + 9, bits, bits, np.zeros(1, np.uint64), 64, 0.0, 0.1, 1)
-        assert pairs[0, 2] == pytest.approx(1 - value.bit_count() / 64)
-
-
-def test_best_pairs_by_brute_force():
-    rng = np.random.default_rng(3)
-    left, right = rng.uniform(0, 1, (7, 7)), rng.uniform(0, 1, (9, 7))
-    right[:3] = left[:3] + 0.01  # pairs that explain one limb twice
-    flags = [rng.random((n, 150)) < 0.2 for n in (7, 9)]
-    taken = rng.random(150) < 0.3
-    trade, apart = 0.05, 0.2
-    expected = []
-    for a in range(7):
-        for b in range(9):
-            cost = 1 - (flags[0][a] | flags[1][b] | taken).mean() + trade * (left[a, 6] + right[b, 6])
-            for part in (slice(0, 3), slice(3, 6)):
-                gap = np.linalg.norm(left[a, part] - right[b, part])
-                cost += 0.05 * (1 - gap / apart) if gap < apart else 0.0
-            expected.append((cost, a, b))
-    expected.sort()
-    bits = [np.array([bits_of(row) for row in f]) for f in flags]
-    pairs = limb_kernels.best_pairs(left, right, *bits, bits_of(taken), 150, trade, apart, 10)
-    assert len(pairs) == 10
-    for (a, b, cost), (best, i, j) in zip(pairs, expected, strict=False):
-        assert (a, b) == (i, j)
-        assert cost == pytest.approx(best, abs=1e-12)
-
-
-def test_samples_near_a_limb_by_brute_force():
-    rng = np.random.default_rng(4)
-    limb = np.array([0.3, 0.0, 0.0, 0.3, 0.3, 0.0, 0.1])
-    base, radii, tip = np.zeros(3), np.array([0.06, 0.05, 0.03]), 0.1
-    samples = rng.uniform([-0.1, -0.1, -0.1], [0.4, 0.5, 0.1], (200, 3))
-    chain = np.array([base, limb[:3], limb[3:6], [0.3, 0.3 + tip, 0.0]])
-    thick = np.array([0.06, 0.05, 0.03, 0.03])
-    near = np.zeros(200, bool)
-    for s in range(3):
-        along = chain[s + 1] - chain[s]
-        t = np.clip((samples - chain[s]) @ along / (along @ along), 0, 1)
-        off = np.linalg.norm(samples - chain[s] - t[:, None] * along, axis=1)
-        near |= off < thick[s] + t * (thick[s + 1] - thick[s]) + 0.02
-    bits = limb_kernels.covered_by_limb(limb, base, radii, tip, samples, 0.02)
-    assert bits.dtype == np.uint64
-    assert len(bits) == 4
-    assert 10 < near.sum() < 150
-    np.testing.assert_array_equal(bits, bits_of(near))
-
-
 def test_directions_cover_the_sphere_evenly():
     directions = search.sphere_directions(100)
     np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1)
@@ -260,6 +159,60 @@ def test_turning_about_keeps_the_volume_and_swaps_the_sides():
 # limbs
 
 
+def tube_by_hand(depth, a, b, ra, rb, steps, clip, skip):
+    """The mean over a cone's axis: how far its surface misses the hull's, in units of `clip`, squared."""
+    t = skip + (1 - skip) * (np.arange(steps) + 0.5) / steps
+    phi = np.array([depth(a + s * (b - a)) for s in t])
+    radius = ra + t * (rb - ra)
+    miss = phi + radius + np.where(phi > 0, clip, 0.0)  # outside the hull altogether
+    thin = np.maximum(miss - limb_kernels.EATEN * radius, 0.0)  # what ragged masks may have eaten is forgiven
+    return (np.clip(np.where(miss > 0, 2 * thin, miss), -clip, 2 * clip) ** 2).mean() / clip**2
+
+
+def test_score_of_a_tube_against_numpy():
+    rng = np.random.default_rng(9)
+    radius = 0.06
+    hull = hull_where(lambda p: np.hypot(p[:, 0] - 0.01, p[:, 1] - 0.01) - radius, [-0.3] * 3, [0.3] * 3)
+    grid = (hull.sdf, hull.origin_m, VOXEL)
+
+    def depth(point):
+        return kernels.depth_at(*grid, *point)
+
+    seen = []
+    for n in range(300):
+        a, b = rng.uniform(-0.25, 0.25, (2, 3)) * [0.3, 0.3, 1.0]
+        ra, rb, clip, skip = rng.uniform([0.02, 0.02, 0.02, 0.0], [0.1, 0.1, 0.06, 0.5])
+        steps = 4 + n % 5
+        expected = tube_by_hand(depth, a, b, ra, rb, steps, clip, skip)
+        score = limb_kernels.tube_score(*grid, *a, *b, ra, rb, steps, clip, skip, 1e9)
+        assert score == pytest.approx(expected, rel=1e-9, abs=1e-12)
+        seen.append(score)
+        # whoever has lost already is not measured to the end
+        for most in (0.5 * expected, 1.0001 * expected + 1e-9):
+            early = limb_kernels.tube_score(*grid, *a, *b, ra, rb, steps, clip, skip, most)
+            if expected > most:
+                assert most < early <= score
+            else:
+                assert early == score
+    assert min(seen) < 0.1
+    assert max(seen) > 3.5
+
+
+def test_a_tube_may_be_thinner_but_not_thicker_than_expected():
+    hull = hull_where(lambda p: np.hypot(p[:, 0] - 0.01, p[:, 1] - 0.01) - 0.05, [-0.3] * 3, [0.3] * 3)
+
+    def score(radius, x=0.01):
+        ends = (x, 0.01, -0.2, x, 0.01, 0.2)
+        return limb_kernels.tube_score(hull.sdf, hull.origin_m, VOXEL, *ends, radius, radius, 6, 0.04, 0.0, 1e9)
+
+    assert score(0.05) == pytest.approx(0.0, abs=1e-6)
+    eaten = 0.05 / (1 - limb_kernels.EATEN)  # so thick was the limb of which the masks left 5 cm
+    assert score(eaten - 1e-4) == pytest.approx(0.0, abs=1e-6)
+    assert score(eaten + 0.01) > 0.02
+    assert score(0.03) == pytest.approx((0.02 / 0.04) ** 2, rel=1e-4)  # thin in a thick hull: something else is there
+    assert score(0.05, x=0.25) == pytest.approx(4.0)  # outside: as bad as can be
+
+
 @pytest.mark.parametrize("kind", [ARM, LEG], ids=["arm", "leg"])
 @pytest.mark.parametrize("side", "LR")
 def test_limb_candidates_contain_the_true_limb(person, kind, side):
@@ -279,53 +232,6 @@ def test_limb_candidates_contain_the_true_limb(person, kind, side):
     lower = np.linalg.norm(limbs.found[:, 3:6] - limbs.found[:, :3], axis=1)
     np.testing.assert_allclose(upper, limbs.lengths[0])
     np.testing.assert_allclose(lower, limbs.lengths[1])
-
-
-@pytest.mark.parametrize("kind", [ARM, LEG], ids=["arm", "leg"])
-def test_a_limb_is_turned_to_its_candidate(person, kind):
-    rng = np.random.default_rng(7)
-    for side in "LR":
-        first, second, third = (BONE[f"{name}_{side}"] for name in kind.bones)
-        base = person.placed.origins[first]
-        lengths = [
-            np.linalg.norm(person.placed.origins[b] - person.placed.origins[a])
-            for a, b in ((first, second), (second, third))
-        ]
-        for _ in range(10):
-            upper, lower = rng.normal(size=(2, 3))
-            middle = base + lengths[0] * upper / np.linalg.norm(upper)
-            end = middle + lengths[1] * lower / np.linalg.norm(lower)
-            turned = search.with_limb(person.state, person.placed, kind, side, np.concatenate([middle, end, [0.0]]))
-            placed = place(turned)
-            np.testing.assert_allclose(placed.origins[second], middle, atol=0.012)
-            np.testing.assert_allclose(placed.origins[third], end, atol=0.025)
-            R = turned.rotations
-            np.testing.assert_allclose(R @ R.transpose(0, 2, 1), np.tile(np.eye(3), (len(R), 1, 1)), atol=1e-9)
-            others = [b for b in range(figure.N_BONES) if b not in (first, second, third)]
-            np.testing.assert_array_equal(R[others], person.state.rotations[others])
-
-
-def test_pairs_explain_the_surface_together(person):
-    """Of all legs, the true pair is among the best: it covers both legs' surface, not one of them twice."""
-    explained = search.explained_volume(person.hull, person.placed, search.UPPER_TRUNK_PARTS)
-    legs = [search.limb_candidates(person.hull, person.medial, person.placed, LEG, s, explained, 40) for s in "LR"]
-    samples = person.placed.spheres[
-        [i for i, n in enumerate(figure.SPHERE_NAMES) if n[:-2] in ("calf", "knee", "ankle")]
-    ]
-    pairs = search.limb_pairs(*legs, samples, np.zeros(len(samples), bool), 0.02, 3)
-    assert [cost for *_, cost in pairs] == sorted(cost for *_, cost in pairs)
-    a, b, _ = pairs[0]
-    for limb, row, side in ((legs[0], a, "L"), (legs[1], b, "R")):
-        foot = person.placed.origins[BONE[f"foot_{side}"]]
-        assert np.linalg.norm(limb.found[row, 3:6] - foot) < 0.15
-
-
-def test_no_candidates_no_pairs():
-    nothing = Limbs(np.zeros(3), np.ones(2), np.ones(3), 0.1, np.empty((0, 7)))
-    some = Limbs(np.zeros(3), np.ones(2), np.ones(3), 0.1, np.ones((1, 7)))
-    samples, explained = np.zeros((4, 3)), np.zeros(4, bool)
-    assert search.limb_pairs(nothing, some, samples, explained, 0.02, 1) == []
-    assert search.limb_pairs(some, nothing, samples, explained, 0.02, 1) == []
 
 
 def test_explained_volume_worked_by_hand():
