@@ -261,12 +261,12 @@ def evaluate_blocks(
         state[3] = 0.0
         # The cameras that see the block furthest outside most likely deny its voxels: ask them first.
         wanted = per
-        for c in range(len(cams)):
-            at = c
-            while at > 0 and outward[0, order[at - 1]] < outward[0, c]:
+        for new in range(len(cams)):
+            at = new
+            while at > 0 and outward[0, order[at - 1]] < outward[0, new]:
                 order[at] = order[at - 1]
                 at -= 1
-            order[at] = c
+            order[at] = new
         for c in order:
             project_block(cams, c, points, seen)
             if outward[1, c] > 0.0:
