@@ -154,9 +154,11 @@ def test_helps_and_examples_are_put_into_the_pages(monkeypatch):
     monkeypatch.syspath_prepend(str(ROOT / "tools"))
     import docs_hooks
 
-    page = docs_hooks.on_page_markdown("a\n<!-- help: export -->\n\n--8<-- slow_down_near_hand\n")
+    page = docs_hooks.on_page_markdown("a\n<!-- help: export -->\n\n<!-- example: slow_down_near_hand -->\n")
     assert "usage: limbloc export" in page
     assert "class SlowDown(Node)" in page
     for path in PAGES:
         for words in docs_hooks.HELP.findall(path.read_text(encoding="utf-8")):
             assert docs_hooks.command_help(words).startswith(f"usage: limbloc {words}")
+        for name in docs_hooks.EXAMPLE.findall(path.read_text(encoding="utf-8")):
+            assert docs_hooks.example(name).startswith("# SPDX")
