@@ -38,7 +38,8 @@ def commands(text):
     """Command lines of ours in code, without comments (after `#`, or after a wide gap as in help texts)."""
     for line in code_lines(text):
         for program in PROGRAMS:
-            if line.startswith(program) and not re.match(r"limbloc \w+: ", line):  # what it says, not what is typed
+            said = re.match(r"limbloc \w+: ", line)  # what it prints, not what is typed
+            if line.startswith(program) and not said and not re.search(r"\b(ACTION|COMMAND)\b", line):
                 yield re.split(r"\s{3,}|\s#", line.removeprefix(program))[0]
 
 
