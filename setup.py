@@ -64,13 +64,13 @@ setup(
             "mypy==2.4.1",
             "types-PyYAML",
             "scipy-stubs",
-            "ezc3d>=1.5,<2",
+            "ezc3d>=1.6.3,<2",
             "foxglove-sdk>=0.20,<0.31",
             "websockets>=13,<18",
         ],
-        "export": ["ezc3d>=1.5,<2"],  # C3D; the other formats need nothing
+        "export": ["ezc3d>=1.6.3,<2"],  # C3D; the other formats need nothing
         "foxglove": ["foxglove-sdk>=0.20,<0.31"],  # a live view in a browser
-        "docs": ["mkdocs>=1.6,<2", "mkdocs-material>=9.5,<10", "mkdocstrings[python]>=0.29,<2"],
+        "docs": ["mkdocs>=1.6,<2", "mkdocs-material>=9.6,<10", "mkdocstrings[python]>=1.0,<2"],
         "viewer": ["open3d-cpu>=0.19,<0.21"],
     },
     zip_safe=False,
