@@ -26,6 +26,7 @@ ACTIONS = {
     "export": "write a rig file for another tool",
     "calibrate": "calibrate all cameras with a checkerboard or ChArUco board",
     "check": "find out from footage of a person whether a rig file is right, and which camera is not",
+    "plan": "where to hang cameras, what they see, and how fat the hull will be",
 }
 
 

@@ -163,8 +163,8 @@ def write_report(rig: Rig, report: Report, folder: Path, source: str) -> Path:
     if report.pairs is not None:
         pictures["pairs.png"] = pair_picture(report.pairs, rig.names)
         sections.append(
-            Section("pairs", "Camera by camera", "Unexplained foreground when two cameras alone are asked: a camera "
-                    "that is out of place has a dark row.", pictures["pairs.png"], "matrix of pairs")
+            Section("pairs", "Camera by camera", "Unexplained foreground when two cameras alone are asked. Two agree "
+                    "easily: what is dark here is badly wrong.", pictures["pairs.png"], "matrix of pairs")
         )  # fmt: skip
     sections.append(Section("rig", "The room", "Cameras and carve volume.", pictures["rig.png"], "cameras", wide=True))
     try:

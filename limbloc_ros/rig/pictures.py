@@ -13,7 +13,8 @@ from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from numpy.typing import NDArray
 
-from limbloc_ros.core.camera import Camera
+from limbloc_ros.core.camera import Camera, Rig
+from limbloc_ros.rig.plan import STEP_M, Coverage
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.uint8]
@@ -108,6 +109,61 @@ def pair_picture(table: Array, names: Sequence[str]) -> bytes:
     axes.set_xticks(range(len(names)), names, rotation=45, ha="right", fontsize=8)
     axes.set_yticks(range(len(names)), names, fontsize=8)
     axes.set_title("unexplained foreground of pairs, %", fontsize=9)
+    return png(figure)
+
+
+def coverage_map(coverage: Coverage, rig: Rig) -> bytes:
+    """A floor plan: how many cameras see each place from ankles to raised hands, and the cameras."""
+    figure = Figure(figsize=(6.6, 5.6), layout="constrained")
+    axes = figure.add_subplot()
+    most = len(rig.cameras)
+    extent = (
+        coverage.x[0] - STEP_M / 2, coverage.x[-1] + STEP_M / 2, coverage.y[0] - STEP_M / 2, coverage.y[-1] + STEP_M / 2,
+    )  # fmt: skip
+    image = axes.imshow(
+        coverage.whole.T,
+        origin="lower",
+        extent=extent,
+        cmap="viridis",
+        vmin=-0.5,
+        vmax=most + 0.5,
+        interpolation="nearest",
+    )
+    bad = np.where(coverage.needed > coverage.whole.T, 1.0, np.nan)
+    axes.imshow(
+        bad, origin="lower", extent=extent, cmap="autumn", vmin=0.9, vmax=2, alpha=0.55, interpolation="nearest"
+    )
+    figure.colorbar(image, ax=axes, label="cameras", ticks=range(0, most + 1, max(1, most // 8)))
+    for i, camera in enumerate(rig.cameras):
+        x, y = camera.T_world_camera[:2, 3]
+        dx, dy = camera.T_world_camera[:2, 2]
+        axes.annotate(
+            "", (x + 0.5 * dx, y + 0.5 * dy), (x, y), arrowprops={"arrowstyle": "-|>", "color": colour(i), "lw": 1.6}
+        )
+        axes.plot(x, y, "o", color=colour(i), ms=6)
+        axes.text(x, y, f" {camera.name}", fontsize=8, color="black", va="bottom")
+    axes.set(
+        xlabel="x m",
+        ylabel="y m",
+        aspect="equal",
+        title=f"seen from ankles to raised hands; red: by fewer than {coverage.needed} cameras",
+    )
+    axes.title.set_fontsize(9)
+    axes.margins(0.08)
+    return png(figure)
+
+
+def fatness_plot(counts: Sequence[int], factors: Sequence[Sequence[float]]) -> bytes:
+    """Number of cameras -> volume of the hull over that of the body: each place, and their median."""
+    figure = Figure(figsize=(6.2, 3.4), layout="constrained")
+    axes = figure.add_subplot()
+    for count, values in zip(counts, factors, strict=True):
+        axes.plot([count] * len(values), values, "o", color="#9fb8d0", ms=4)
+    axes.plot(
+        counts, [float(np.median(values)) if len(values) else np.nan for values in factors], "o-", color=COLOURS[0]
+    )
+    axes.set(xlabel="cameras", ylabel="hull / body volume", ylim=(0.9, None), xticks=counts)
+    axes.grid(alpha=0.3)
     return png(figure)
 
 
