@@ -117,22 +117,12 @@ def coverage_map(coverage: Coverage, rig: Rig) -> bytes:
     figure = Figure(figsize=(6.6, 5.6), layout="constrained")
     axes = figure.add_subplot()
     most = len(rig.cameras)
-    extent = (
-        coverage.x[0] - STEP_M / 2, coverage.x[-1] + STEP_M / 2, coverage.y[0] - STEP_M / 2, coverage.y[-1] + STEP_M / 2,
-    )  # fmt: skip
-    image = axes.imshow(
-        coverage.whole.T,
-        origin="lower",
-        extent=extent,
-        cmap="viridis",
-        vmin=-0.5,
-        vmax=most + 0.5,
-        interpolation="nearest",
-    )
+    half = STEP_M / 2
+    extent = (coverage.x[0] - half, coverage.x[-1] + half, coverage.y[0] - half, coverage.y[-1] + half)
+    how: dict[str, Any] = {"origin": "lower", "extent": extent, "interpolation": "nearest"}
+    image = axes.imshow(coverage.whole.T, cmap="viridis", vmin=-0.5, vmax=most + 0.5, **how)
     bad = np.where(coverage.needed > coverage.whole.T, 1.0, np.nan)
-    axes.imshow(
-        bad, origin="lower", extent=extent, cmap="autumn", vmin=0.9, vmax=2, alpha=0.55, interpolation="nearest"
-    )
+    axes.imshow(bad, cmap="autumn", vmin=0.9, vmax=2, alpha=0.55, **how)
     figure.colorbar(image, ax=axes, label="cameras", ticks=range(0, most + 1, max(1, most // 8)))
     for i, camera in enumerate(rig.cameras):
         x, y = camera.T_world_camera[:2, 3]
