@@ -56,6 +56,8 @@ HARDER = Effort(torsos=14, leg_pairs=4, starts=24, survivors=8, repaired=4)
 DOUBTFUL_COST = 5e-4
 #: Below this energy (m^2) only the best candidate's limbs are looked for again.
 EASY_COST = 2.2e-4
+#: Figures of up to so many times the least energy are rivals.
+RIVAL_COST = 1.5
 
 #: Candidates for one limb.
 CANDIDATES = 80
@@ -72,12 +74,12 @@ class Fit:
     Attributes:
         state: the figure.
         system: energy, gradient and matrix there.
-        runner_up: energy of the next best finalist, m^2.
+        rivals: figures that explain the hull nearly as well, each with its energy over that of the best of them.
     """
 
     state: FigureState
     system: lm.System
-    runner_up: float
+    rivals: tuple[tuple[FigureState, float], ...] = ()
 
 
 def gather_evidence(
@@ -228,10 +230,12 @@ def _fit_from_torsos(torsos: list[FigureState], scene: Scene, effort: Effort) ->
         others = with_arms(candidate.state, scene, effort.arm_repairs)
         others += _cheapest(_with_limbs([candidate.state], scene, effort.leg_pairs), scene, effort.leg_repairs)
         tried += [refine(state, quick, lenient, repair) for state in others]
+    least = _best(tried, 1)[0].system.cost
+    rivals = tuple((r.state, r.system.cost / least) for r in tried if r.system.cost < RIVAL_COST * least)
     tried = [refine(r.state, quick, scene.weights, strict) for r in _best(tried, effort.strict)]
     finals = [refine(r.state, scene.full, scene.weights, final) for r in _best(tried, effort.finalists)]
-    finals = _best(finals, effort.finalists)
-    return Fit(finals[0].state, finals[0].system, finals[-1].system.cost)
+    winner = _best(finals, 1)[0]
+    return Fit(winner.state, winner.system, rivals)
 
 
 def _with_limbs(states: list[FigureState], scene: Scene, leg_pairs: int) -> list[FigureState]:

@@ -79,7 +79,7 @@ class PoseEstimator:
         clock.lap("fit")
         if fit is None:
             return NoPerson("the hull holds nothing that a torso fits into")
-        return describe_pose(fit.state, hull, fit.system, clock.stage_ms)
+        return describe_pose(fit.state, hull, fit.system, clock.stage_ms, fit.rivals)
 
     def reset(self) -> None:
         """Forget the last frame (a new recording, a jump back in time)."""

@@ -60,7 +60,7 @@ class Tracker:
             result = refine(carried, evidence, self._weights, 10 if np.abs(moved).max() < 0.1 else 20)
             if self._frame % self.PATIENCE == 0:
                 result = self._check_arms(result, hull, surface)
-            fit = Fit(result.state, result.system, np.inf)
+            fit = Fit(result.state, result.system)
         if fit is None or self._doubts(fit.system.cost):
             self._last_scratch = self._frame
             scratch = fit_from_scratch(hull, surface, self._seed, self._weights, self._effort, None)
