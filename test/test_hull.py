@@ -15,7 +15,7 @@ from limbloc_ros.core import pipeline
 from limbloc_ros.core.camera import Camera, Rig
 from limbloc_ros.core.config import HullConfig
 from limbloc_ros.core.errors import InputError, NoPerson, RigError
-from limbloc_ros.core.hull import Hull, carve, evaluate, evaluate_again, largest_component
+from limbloc_ros.core.hull import NOBODY, Hull, carve, evaluate, evaluate_again, largest_component
 from limbloc_ros.core.silhouettes import cleaned, measure_silhouettes, min_seen, pack_cameras
 
 LENSES = [
@@ -357,6 +357,112 @@ def test_the_same_masks_give_the_same_bits():
     assert len(hulls_seen) == 1
 
 
+# who cut the hull
+
+
+def who_cut(hull):
+    """Lattice indices [V, 3] of the shell's voxels and the row of the camera that decided each."""
+    indices, _ = hull.shell()
+    local = indices - np.asarray(hull.index_min)
+    return indices, hull.cut_by[tuple(local.T)]
+
+
+def box_masks(rig, half):
+    """Masks of a box in the middle of the room as cameras that look along an axis see its middle plane."""
+    masks = {}
+    for camera in rig.cameras:
+        v, u = np.mgrid[: camera.height, : camera.width]
+        depth = np.linalg.norm(camera.T_world_camera[:3, 3] - [0.0, 0.0, 1.0])
+        rays = np.stack([(u - camera.K[0, 2]) / camera.K[0, 0], (v - camera.K[1, 2]) / camera.K[1, 1]], axis=-1)
+        flat = np.concatenate([rays, np.ones((*u.shape, 1))], axis=-1) * depth
+        points = flat @ camera.T_world_camera[:3, :3].T + camera.T_world_camera[:3, 3] - [0.0, 0.0, 1.0]
+        masks[camera.name] = np.where((np.abs(points) < half).all(axis=-1), 255, 0).astype(np.uint8)
+    return masks
+
+
+@pytest.mark.parametrize("names", [("front", "side"), ("front", "side", "top"), ("top", "front", "side")])
+def test_who_cut_a_box(names):
+    """A face of a box is cut by a camera that sees it edge on, not by the one that looks at it."""
+    places = {"front": (-6.0, 0.0, 1.0), "side": (0.0, -6.0, 1.0), "top": (0.0, 0.0, 7.0)}
+    cameras = [look_at(name, places[name], (0.0, 0.0, 1.0), focal=300.0, size=(201, 201)) for name in names]
+    rig = Rig(tuple(cameras), np.array([-1.0, -1.0, 0.2]), np.array([1.0, 1.0, 1.8]))
+    half = np.array([0.6, 0.45, 0.5])
+    masks, config = box_masks(rig, half), HullConfig(voxel_m=0.05, min_share=0.0, min_cameras=2)
+    hull = carve(masks, rig, config)
+    assert isinstance(hull, Hull)
+    assert hull.cut_by.dtype == np.uint8
+    assert hull.viewpoints.dtype == np.float32
+    np.testing.assert_allclose(hull.viewpoints, [places[name] for name in names], atol=1e-6)
+    indices, who = who_cut(hull)
+    assert set(who) == set(range(len(names)))
+    # by hand: what sticks out most, and who sees it
+    beyond = np.abs((indices + 0.5) * 0.05 - [0.0, 0.0, 1.0]) - half
+    by = np.array(names)[who]
+    for axis, blind in enumerate(("front", "side", "top")):
+        others = np.delete(beyond, axis, axis=1).max(axis=1)
+        clear = (beyond[:, axis] > -0.03) & (beyond[:, axis] > others + 0.12)
+        assert clear.sum() > 100
+        assert (by[clear] != blind).all()
+    # and by all distances of all voxels
+    every, distances, largest, unsure = every_voxel(rig, masks, 0.05, config.band_m, names)
+    shape = every.max(axis=0) - every.min(axis=0) + 1
+    at = np.ravel_multi_index(tuple((indices - every.min(axis=0)).T), shape)
+    clear = (distances[0] - distances[1])[at] > 1e-5
+    clear &= ~unsure[at]
+    assert clear.mean() > 0.8
+    np.testing.assert_array_equal(who[clear], largest[at][clear])
+    # elsewhere nobody
+    everywhere = hull.cut_by.copy()
+    everywhere[tuple((indices - np.asarray(hull.index_min)).T)] = NOBODY
+    assert (everywhere == NOBODY).all()
+
+
+def test_who_cut_a_hull_whose_mask_was_mended():
+    """Voxels that are evaluated again are cut by whoever decides then."""
+    rig = ring(8, focal=110.0, size=(160, 120))
+    arm = [((x, 0.3, 1.0), 0.06) for x in np.linspace(0.2, 0.75, 12)]
+    masks = ball_masks(rig, BODY + arm)
+    masks["cam1"] = ball_masks(rig, BODY)["cam1"]
+    config = dataclasses.replace(CONFIG, shared_veto=0.0)
+    silhouettes = measured(rig, masks, config)
+    voxels = evaluate(silhouettes, rig, config.voxel_m, config.band_m)
+    covered = hulls.cover_silhouettes(silhouettes, voxels, config)
+    mended = hulls.mend_silhouettes(silhouettes, covered, voxels, config)
+    assert mended is not silhouettes
+    indices, _, _, who = evaluate(mended, rig, config.voxel_m, config.band_m)
+    expected = {tuple(index): int(w) for index, w in zip(indices.tolist(), who, strict=True)}
+    hull = carve(masks, rig, config)
+    for index, w in zip(*who_cut(hull), strict=True):
+        assert expected[tuple(index.tolist())] == w
+
+
+def test_cameras_that_are_left_out_have_no_viewpoint(eight):
+    rig, masks, _ = eight
+    hull = carve({**masks, "cam2": np.zeros_like(masks["cam2"])}, rig, CONFIG)
+    assert hull.cameras == tuple(name for name in rig.names if name != "cam2")
+    places = [rig.camera(name).T_world_camera[:3, 3] for name in hull.cameras]
+    np.testing.assert_array_equal(hull.viewpoints, np.float32(places))
+    _, who = who_cut(hull)
+    assert set(who) <= set(range(7))
+    assert len(set(who)) > 3
+
+
+def test_shell_keeps_who_cut(eight):
+    _, _, hull = eight
+    indices, values = hull.shell()
+    _, who = who_cut(hull)
+    shuffled = np.random.default_rng(0).permutation(len(indices))
+    again = Hull.from_shell(
+        hull.voxel_m, hull.band_m, indices[shuffled], values[shuffled], cut_by=who[shuffled], viewpoints=hull.viewpoints
+    )
+    assert again.cut_by.dtype == np.uint8
+    np.testing.assert_array_equal(again.cut_by, hull.cut_by)
+    np.testing.assert_array_equal(again.viewpoints, hull.viewpoints)
+    without = Hull.from_shell(hull.voxel_m, hull.band_m, indices, values)
+    assert without.cut_by is None
+    assert without.viewpoints.shape == (0, 3)
+
+
 BODY = [((0.0, 0.0, 0.5), 0.3), ((0.0, 0.0, 0.9), 0.3), ((0.0, 0.0, 1.3), 0.25)]
 CONFIG = HullConfig(voxel_m=0.04, min_voxels=100)
 
@@ -527,6 +633,30 @@ def test_largest_component_drops_the_rest_and_its_shell():
     kept = largest_component(both)
     assert kept.index_min == alone.index_min
     np.testing.assert_array_equal(kept.sdf, alone.sdf)
+
+
+def test_largest_component_keeps_who_cut_where_it_was():
+    solid = np.zeros((30, 20, 20), bool)
+    solid[2:10, 2:12, 2:12] = True
+    solid[20:25, 3:8, 3:8] = True
+    both = hull_of(solid)
+    rows = np.random.default_rng(0).integers(0, 8, both.sdf.shape).astype(np.uint8)
+    shell = both.sdf < np.float32(both.band_m)
+    viewpoints = np.random.default_rng(1).normal(size=(8, 3)).astype(np.float32)
+    both = dataclasses.replace(both, cut_by=np.where(shell, rows, np.uint8(NOBODY)), viewpoints=viewpoints)
+    kept = largest_component(both)
+    assert kept.sdf.shape != both.sdf.shape
+    assert kept.cut_by.shape == kept.sdf.shape
+    assert kept.viewpoints is viewpoints
+    before = {tuple(index): w for index, w in zip(both.shell()[0].tolist(), who_cut(both)[1], strict=True)}
+    indices, who = who_cut(kept)
+    assert [before[tuple(index)] for index in indices.tolist()] == who.tolist()
+    assert (kept.cut_by[kept.sdf >= np.float32(kept.band_m)] == NOBODY).all()
+    # the border stays empty and the hull is what its shell makes
+    again = Hull.from_shell(
+        kept.voxel_m, kept.band_m, *kept.shell(), cut_by=who_cut(kept)[1], viewpoints=kept.viewpoints
+    )
+    np.testing.assert_array_equal(again.cut_by, kept.cut_by)
 
 
 def test_largest_component_keeps_a_single_one_and_bridges_small_gaps():

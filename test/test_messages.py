@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import struct
 from array import array
 
@@ -331,6 +332,46 @@ def test_the_hull_comes_back_bit_for_bit(voxel_m: float) -> None:
     assert back.sdf.shape == hull.sdf.shape
 
 
+def test_who_cut_the_hull_comes_back_bit_for_bit() -> None:
+    hull = ball(0.05, 0.5)
+    rng = np.random.default_rng(0)
+    viewpoints = rng.normal(0, 3, (5, 3)).astype(np.float32)
+    shell = hull.sdf < np.float32(hull.band_m)
+    rows = rng.choice(np.array([0, 1, 3, 4, NOBODY], np.uint8), hull.sdf.shape)  # camera 2 decides nowhere
+    hull = dataclasses.replace(hull, cut_by=np.where(shell, rows, np.uint8(NOBODY)), viewpoints=viewpoints)
+    back = cloud_to_hull(hull_to_cloud(hull, HEADER))
+    assert back is not None and back.cut_by is not None and hull.cut_by is not None
+    assert back.sdf.tobytes() == hull.sdf.tobytes()
+    assert (back.cut_by.dtype, back.viewpoints.dtype) == (np.uint8, np.float32)
+    assert back.cut_by.tobytes() == hull.cut_by.tobytes()
+    for camera in (0, 1, 3, 4):
+        assert back.viewpoints[camera].tobytes() == viewpoints[camera].tobytes()
+
+
+def test_a_hull_of_which_nobody_knows_who_cut_it() -> None:
+    """Neither without `cut_by`, nor where no camera decided, nor where its place is not known."""
+    hull = ball(0.1, 1.0)
+    nobody = np.full(hull.sdf.shape, NOBODY, np.uint8)
+    for unknown in (
+        hull,
+        dataclasses.replace(hull, cut_by=nobody, viewpoints=np.zeros((3, 3), np.float32)),
+        dataclasses.replace(hull, cut_by=nobody - 200, viewpoints=np.ones((3, 3), np.float32)),
+    ):
+        back = cloud_to_hull(hull_to_cloud(unknown, HEADER))
+        assert back is not None
+        assert back.cut_by is None
+        assert back.viewpoints.shape == (0, 3)
+        assert back.sdf.tobytes() == hull.sdf.tobytes()
+
+
+def test_where_nobody_cut_no_place_is_asked_for() -> None:
+    """Bytes of a place are read only where a camera is named."""
+    msg = overwritten(32, struct.pack("<fff", float("nan"), 1.0, 2.0))
+    back = cloud_to_hull(msg)
+    assert back is not None
+    assert back.cut_by is None
+
+
 def test_an_empty_cloud_is_nobody() -> None:
     assert cloud_to_hull(empty_hull_cloud(HEADER)) is None
 
@@ -362,6 +403,10 @@ def overwritten(offset: int, value: bytes) -> PointCloud2:
         (overwritten(12, struct.pack("<f", 7.0)), "below the band"),
         (overwritten(24, struct.pack("<I", 5)), "one voxel size"),
         (overwritten(16, struct.pack("<hhh", 32_000, -32_000, 32_000)), "too large"),
+        (overwritten(22, struct.pack("<H", 256)), r"up to 255 \(nobody\), got 256"),
+        (overwritten(22, struct.pack("<H", 65_535)), "got 65535"),
+        (overwritten(22, struct.pack("<HIIf", 3, 100_000, 60_000, float("nan"))), "vp_x, vp_y, vp_z.*finite"),
+        (overwritten(22, struct.pack("<HIIfff", 0, 100_000, 60_000, 1.0, 2.0, float("-inf"))), "finite"),
     ],
 )
 def test_clouds_that_no_hull_makes_are_refused(msg: PointCloud2, words: str) -> None:
