@@ -1,0 +1,250 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From frame to frame: what is carried along, when a fit is doubted, and how an arm that slipped comes back."""
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from limbloc_ros.core import tracker
+from limbloc_ros.core.engine_robust import Fit
+from limbloc_ros.core.figure import BONE, FigureState, place
+from limbloc_ros.core.hull import Hull
+from limbloc_ros.core.limb_pairs import with_limb
+from limbloc_ros.core.pipeline import Carver
+from limbloc_ros.core.pose import JOINT, JOINT_NAMES
+from limbloc_ros.core.search import ARM
+from limbloc_ros.core.surface import extract_surface
+from limbloc_ros.core.tracker import Tracker
+from limbloc_ros.recordings.cases import load_case
+
+BENCHMARK = Path(__file__).parent / "data" / "benchmark"
+WALK = "public/seq_walk_circle"
+FRAMES = range(20, 24)
+
+
+@cache
+def case():
+    return load_case(BENCHMARK / WALK)
+
+
+@cache
+def hull_of(frame):
+    hull = Carver(case().rig).carve(case().masks(frame))
+    assert isinstance(hull, Hull)
+    return hull
+
+
+@cache
+def surface_of(frame):
+    return extract_surface(hull_of(frame))
+
+
+def truth_of(frame):
+    """[25, 3] true joints, m."""
+    return np.array([case().truth[joint][frame] for joint in JOINT_NAMES])
+
+
+def errors(fit, frame):
+    return np.linalg.norm(place(fit.state).joints - truth_of(frame), axis=1)
+
+
+def follow(follower, frame):
+    return follower.follow(hull_of(frame), surface_of(frame))
+
+
+# on a walk
+
+
+def test_the_tracker_follows_a_walk():
+    follower = Tracker(seed=0)
+    for frame in FRAMES:
+        error = errors(follow(follower, frame), frame)
+        assert np.median(error) < 0.03, frame
+        assert error.mean() < 0.05, frame
+
+
+def test_the_tracker_starts_from_the_frame_before_until_it_is_reset():
+    follower = Tracker(seed=0)
+    alone = follow(follower, 20).state.to_vector()
+    followed = follow(follower, 20).state.to_vector()
+    assert not np.array_equal(followed, alone)
+    follower.reset()
+    np.testing.assert_array_equal(follow(follower, 20).state.to_vector(), alone)
+
+
+def test_the_same_frames_give_the_same_bits():
+    runs = []
+    for _ in range(2):
+        follower = Tracker(seed=3)
+        runs.append([follow(follower, frame).state.to_vector() for frame in FRAMES[:3]])
+    np.testing.assert_array_equal(runs[0], runs[1])
+
+
+def test_a_jump_is_followed_by_the_centre_of_the_surface():
+    follower = Tracker(seed=0)
+    follow(follower, 20)
+    voxels = np.array([-70, 40, 0])
+    hull = replace(hull_of(21), index_min=tuple(int(i) for i in np.asarray(hull_of(21).index_min) + voxels))
+    jumped = follower.follow(hull, extract_surface(hull))
+    error = np.linalg.norm(place(jumped.state).joints - truth_of(21) - 0.02 * voxels, axis=1)
+    assert np.median(error) < 0.03
+
+
+# an arm that has slipped
+
+
+def test_an_arm_that_slipped_into_the_trunk_is_found_again():
+    start = follow(Tracker(seed=0), 20)
+    placed = place(start.state)
+    shoulder, elbow, hand = (placed.origins[BONE[f"{name}_L"]] for name in ARM.bones)
+    belly = placed.origins[BONE["abdomen"]]
+
+    def towards(a, b, length):
+        return a + length * (b - a) / np.linalg.norm(b - a)
+
+    middle = towards(shoulder, belly, np.linalg.norm(elbow - shoulder))
+    end = towards(middle, belly, np.linalg.norm(hand - elbow))
+    slipped = with_limb(start.state, placed, ARM, "L", np.concatenate([middle, end, [0.0]]))
+    wrist = []
+    for frame_number in (Tracker.PATIENCE - 1, 1):  # the next frame is one where arms are checked, and not
+        follower = Tracker(seed=0)
+        follow(follower, 20)
+        follower._last, follower._frame = slipped, frame_number
+        follower._last_scratch = frame_number  # no start anew
+        wrist.append(errors(follow(follower, 20), 20)[JOINT["wrist_L"]])
+    assert wrist[0] < 0.06
+    assert wrist[1] > 0.15
+
+
+# when a fit is doubted
+
+
+class Stand:
+    """Stands in for searches and refinements: hands out figures of the costs that it is told, and counts."""
+
+    def __init__(self, monkeypatch):
+        self.scratch_cost, self.costs = 1e-4, {}
+        self.searched, self.refined, self.checked = [], [], []
+        self.frame = 0
+        monkeypatch.setattr(tracker, "fit_from_scratch", self.search)
+        monkeypatch.setattr(tracker, "refine", self.refine)
+        monkeypatch.setattr(tracker, "gather_evidence", lambda *args: SimpleNamespace(args=args))
+        monkeypatch.setattr(Tracker, "_check_arms", self.check)
+
+    def search(self, hull, surface, seed, weights, effort, harder):
+        self.searched.append((self.frame, seed, weights, effort, harder))
+        if self.scratch_cost is None:
+            return None
+        return Fit(FigureState.standing([0.0, 0.0, 1.0]), SimpleNamespace(cost=self.scratch_cost))
+
+    def refine(self, state, evidence, weights, iterations):
+        self.refined.append((self.frame, state, iterations))
+        cost = self.costs.get(self.frame, 1e-4)
+        return SimpleNamespace(state=FigureState.standing(state.root), system=SimpleNamespace(cost=cost))
+
+    def check(self, result, hull, surface):
+        self.checked.append(self.frame)
+        return result
+
+    def run(self, follower, frames, centres=None):
+        costs = []
+        for _ in range(frames):
+            self.frame += 1
+            centre = np.zeros(3) if centres is None else centres[self.frame]
+            fit = follower.follow(None, SimpleNamespace(points=centre + np.array([[1.0, 0, 0], [-1.0, 0, 0]])))
+            costs.append(None if fit is None else fit.system.cost)
+        return costs
+
+    @property
+    def search_frames(self):
+        return [frame for frame, *_ in self.searched]
+
+
+@pytest.fixture
+def stand(monkeypatch):
+    return Stand(monkeypatch)
+
+
+def test_calm_frames_are_followed_and_arms_checked_now_and_then(stand):
+    stand.run(Tracker(seed=0), 20)
+    assert stand.search_frames == [1]
+    assert [frame for frame, *_ in stand.refined] == list(range(2, 21))
+    assert stand.checked == [8, 16]
+    assert Tracker.PATIENCE == 8
+
+
+def test_what_is_searched_can_be_said(stand):
+    effort, weights = replace(Tracker.SEARCH, torsos=1), tracker.Weights(surface=2.0)
+    stand.run(Tracker(seed=5, weights=weights, effort=effort), 1)
+    stand.run(Tracker(seed=6), 1)
+    assert stand.searched == [(1, 5, weights, effort, None), (2, 6, tracker.Weights(), Tracker.SEARCH, None)]
+
+
+def test_the_figure_is_carried_with_the_surface(stand):
+    centres = {1: np.zeros(3), 2: np.array([0.05, 0.0, 0.0]), 3: np.array([0.05, 0.2, 0.0])}
+    stand.run(Tracker(seed=0), 3, centres)
+    (_, near, few), (_, far, many) = stand.refined
+    np.testing.assert_allclose(near.root, [0.05, 0.0, 1.0])
+    np.testing.assert_allclose(far.root, [0.05, 0.2, 1.0])
+    assert few < many  # the further it moved, the longer it takes to settle
+
+
+@pytest.mark.parametrize(
+    ("first", "cost", "searched"),
+    [
+        (8, 2.0e-4, [1, 9]),  # twice the usual, until that has become usual
+        (8, 1.3e-4, [1]),
+        (3, 5.0e-4, [1, 9, 17]),  # high, however long
+    ],
+)
+def test_a_doubted_fit_is_searched_anew_but_not_in_every_frame(stand, first, cost, searched):
+    stand.costs = dict.fromkeys(range(first, 99), cost)
+    follower = Tracker(seed=0)
+    stand.run(follower, first - 1)
+    stand.scratch_cost = 0.96 * cost  # hardly better: the figure that was followed stays
+    assert stand.run(follower, 21 - first) == [cost] * (21 - first)
+    assert stand.search_frames == searched
+
+
+def test_a_clearly_better_fit_replaces_the_followed_one(stand):
+    stand.costs = dict.fromkeys(range(9, 12), 6e-4)
+    follower = Tracker(seed=0)
+    stand.run(follower, 8)
+    stand.scratch_cost = 0.94 * 6e-4
+    assert stand.run(follower, 1) == [pytest.approx(0.94 * 6e-4)]
+    assert stand.search_frames == [1, 9]
+
+
+@pytest.mark.parametrize(("above", "searched"), [(0.999, [1, 9]), (1.001, [1, 9, 17])])
+def test_one_odd_frame_hardly_changes_what_is_usual(stand, above, searched):
+    usual = 1e-4 * (1 + 0.2 * 0.9**7)  # 3e-4 counted for a tenth, and then seven calm frames
+    stand.costs = {9: 3e-4, 17: above * Tracker.DOUBT * usual}
+    follower = Tracker(seed=0)
+    stand.run(follower, 8)
+    stand.scratch_cost = None
+    stand.run(follower, 9)
+    assert stand.search_frames == searched
+
+
+def test_nobody_and_somebody_again(stand):
+    stand.scratch_cost = None
+    follower = Tracker(seed=0)
+    assert stand.run(follower, 3) == [None] * 3
+    assert stand.search_frames == [1, 2, 3]  # nothing to follow: every frame is searched
+    stand.scratch_cost = 2e-4
+    assert stand.run(follower, 2) == [2e-4, 1e-4]
+    assert stand.search_frames == [1, 2, 3, 4]
+
+
+def test_reset_forgets_everything(stand):
+    follower = Tracker(seed=0)
+    stand.run(follower, 5)
+    follower.reset()
+    fresh = {key: value for key, value in vars(Tracker(seed=0)).items() if key != "_centre"}
+    assert {key: value for key, value in vars(follower).items() if key != "_centre"} == fresh
+    stand.run(follower, 1)
+    assert stand.search_frames == [1, 6]
