@@ -251,7 +251,7 @@ def surface_cost(point, normal, gate=0.0, inside=2.0, width=0.1, ray=(0.0, 0.0, 
     spheres, radii = np.array([[0.0, 0.0, 0.0], [0.5, 0.0, 0.0]]), np.array([0.1, 0.1])
     parts = np.array([[0, 0, 0], [1, 1, 1]])
     blocks, slopes = np.zeros((2, 12, 12)), np.zeros((2, 12))
-    cost = energy.kernels.surface_term(
+    cost = energy.surface_term(
         np.array([point]), np.array([normal]), np.array([ray]), np.ones(1),
         parts, spheres, radii, width, gate, inside, blocks, slopes,
     )  # fmt: skip

@@ -13,7 +13,7 @@ from limbloc_ros.core._figure_kernels import exp_so3, forward, log_so3
 from limbloc_ros.core._search_kernels import depth_at
 
 
-@njit(cache=True)  # type: ignore[misc, unused-ignore]
+@njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def torso_score(
     sdf: Any, origin: Any, voxel: float, points: Any, radii: Any, weights: Any, n_solid: int, clip: float
 ) -> float:
@@ -39,7 +39,7 @@ def torso_score(
     return total / (norm * clip * clip)
 
 
-@njit(cache=True)  # type: ignore[misc, unused-ignore]
+@njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def place_torso(
     pose: Any, parents: Any, bone_offsets: Any, point_bones: Any, point_offsets: Any, point_radii: Any
 ) -> Any:
@@ -66,7 +66,7 @@ def place_torso(
     return points, radii
 
 
-@njit(cache=True)  # type: ignore[misc, unused-ignore]
+@njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def torso_from_pairs(
     pelvis_seeds: Any,
     head_seeds: Any,
@@ -169,7 +169,7 @@ def torso_from_pairs(
     return out[:count]
 
 
-@njit(cache=True)  # type: ignore[misc, unused-ignore]
+@njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def climb_torso(
     start: Any, noise: Any, sdf: Any, origin: Any, voxel: float, table: Any, weights: Any, n_solid: int, spread: Any
 ) -> Any:

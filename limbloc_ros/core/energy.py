@@ -12,6 +12,7 @@ from limbloc_ros.core import _energy_kernels as kernels
 from limbloc_ros.core import _figure_kernels as figure_kernels
 from limbloc_ros.core import figure
 from limbloc_ros.core._figure_topology import PARTS
+from limbloc_ros.core._surface_fit_kernels import surface_term
 from limbloc_ros.core.figure import FigureState
 from limbloc_ros.core.hull import Hull
 from limbloc_ros.core.lm import System
@@ -208,7 +209,7 @@ def system(state: FigureState, evidence: Evidence, weights: Weights) -> System:
     blocks, slopes = np.zeros((figure.N_PARTS, 12, 12)), np.zeros((figure.N_PARTS, 12))
     flesh = (figure.PART_SPHERES, spheres, radii)
     w = weights
-    cost = kernels.surface_term(
+    cost = surface_term(
         evidence.points,
         evidence.normals,
         evidence.rays,

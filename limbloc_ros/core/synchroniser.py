@@ -207,7 +207,7 @@ class StampSynchroniser(Generic[T]):
         return finished
 
     def skip_until(self, stamp_ns: int) -> None:
-        """Some cameras left out their frames up to this stamp (ns): drop waiting sets up to it, and what comes late."""
+        """Some cameras left out their frames up to this stamp (ns): drop waiting sets up to it, and later arrivals."""
         if self._left_ns is not None and stamp_ns <= self._left_ns:
             return
         kept = [s for s in self._open if s.low_ns > stamp_ns]
