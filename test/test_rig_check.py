@@ -162,6 +162,17 @@ def test_a_camera_whose_masks_are_wrong_is_named():
     assert next(f.cameras for f in report.findings if f.severe) == ("cam2",)
 
 
+def test_a_stranger_in_one_camera_is_no_fault_of_the_rig():
+    """A shadow or a screen far from the person: only its own camera has unexplained foreground."""
+    blob = [{**frame, 3: frame[3].copy()} for frame in recording(WALK)[:8]]
+    for frame in blob:
+        frame[3][120:175, 5:45] = 1
+    report = check(case(WALK).rig, blob)
+    assert report.good
+    assert [(f.kind, f.cameras) for f in report.findings] == [("mask", ("cam3",))]
+    assert "`ignore`" in report.findings[0].text
+
+
 def test_empty_masks_and_strangers_are_said():
     rig = case(WALK).rig
     assert "nothing can be compared" in check(rig, [{}, {}]).findings[0].text

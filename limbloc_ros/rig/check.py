@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -113,7 +113,7 @@ def check(rig: Rig, recording: Sequence[Frame], *, fps: float | None = None, hei
     most = max(len(recording[i]) for i in usable)
     full = [i for i in usable if len(recording[i]) == most]
     chosen = _spread(full, COMPARED)
-    grid, frames = _find_person(rig, look, [recording[i] for i in chosen])
+    grid, _ = _find_person(rig, look, [recording[i] for i in chosen])
     if grid is None:
         report.say(
             "masks",
@@ -121,10 +121,12 @@ def check(rig: Rig, recording: Sequence[Frame], *, fps: float | None = None, hei
             "with one person in the middle of the room?",
         )
         return report
-    frames = _agreement(rig, report, grid, recording, chosen, fps)
-    grid, frames = _find_person(rig, look, frames)  # anew, now that it is known who is right
-    if grid is not None:
-        _world(rig, report, grid, frames, height_m)
+    right: Sequence[Frame] = _agreement(rig, report, grid, recording, chosen, fps)
+    again: Grid | None = grid
+    if report.findings:  # look for the person anew, now that it is known who is right
+        again, right = _find_person(rig, look, right)
+    if again is not None:
+        _world(rig, report, again, right, height_m)
     return report
 
 
@@ -137,7 +139,9 @@ def _spread(items: Sequence[int], count: int) -> list[int]:
 def _find_person(rig: Rig, look: Look, frames: Sequence[Frame]) -> tuple[Grid | None, Sequence[Frame]]:
     """Voxels around where the person is, first coarsely in all that the cameras see; whatever the unit and the up."""
     half = 0.9 * float(np.median(look.distances))
-    grid = make_grid(rig, look.point - half, look.point + half, SEARCH_VOXELS)
+    # For the search lenses may be plain: where the person is matters, not their outline.
+    plain = tuple(replace(camera, distortion=np.zeros(0), distortion_model="none") for camera in rig.cameras)
+    grid = make_grid(replace(rig, cameras=plain), look.point - half, look.point + half, SEARCH_VOXELS)
     for finer in (False, True):
         most = [_hull(grid, frame, tolerant=True) for frame in frames]
         inside_any = np.unique(np.concatenate(most)) if most else np.zeros(0, np.int64)
@@ -250,6 +254,9 @@ def _agreement(
         guilty = _guilty(scores, excused)
         if not guilty:
             break
+        if _strangers(report, scores, guilty[0]):
+            excused.add(guilty[0])
+            continue
         trials = [_explain(grid, recording, chosen, frames, camera, fps) for camera in guilty]
         best = min(trials, key=lambda trial: trial.left)
         _tell(report, grid, scores, best, [grid.names[c] for c in guilty if c != best.camera], fps)
@@ -333,12 +340,30 @@ def _explain(
             if delay:
                 trials.append(_Trial(camera, max(0.0, then - rest) / max(now - rest, 1e-6), delay))
     half = list(frames)[::2] if len(frames) > 4 else list(frames)
-    move = best_move(grid, half, camera)
+    move = best_move(grid, half, camera) if trials[-1].left > 0.15 else None
     if move is not None:
         rest = contradiction(grid, [{c: m for c, m in frame.items() if c != camera} for frame in half])
         trials.append(_Trial(camera, max(0.0, move.after - rest) / max(move.before - rest, 1e-6), move=move))
     # A delay has one parameter, a pose has six: the delay has the benefit of the doubt.
     return min(trials, key=lambda trial: trial.left - 0.15 * bool(trial.delay))
+
+
+def _strangers(report: Report, scores: Scores, camera: int) -> bool:
+    """Whether a camera only shows foreground of its own: a camera out of place takes from all others' hull as well."""
+    own = float(scores.unexplained[camera])
+    others = float(np.nanmean(np.delete(scores.unexplained, camera)))
+    stray = others < GOOD / 2 and own > 6 * others
+    if stray:
+        name = scores.names[camera]
+        report.say(
+            "mask",
+            f"{name} shows foreground that no other camera knows: {100 * own:.0f} % of its own, while that of the "
+            "others is explained. The rig is not to blame: something else moves there. Name that place under `ignore` "
+            "in the rig file, or take a better background picture",
+            (name,),
+            severe=False,
+        )
+    return stray
 
 
 def _tell(report: Report, grid: Grid, scores: Scores, trial: _Trial, rivals: Sequence[str], fps: float | None) -> None:

@@ -13,7 +13,18 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from limbloc_ros.core.camera import Camera
-from limbloc_ros.rig.consistency import Grid, Mask, cover, inside, look_up, score, splat, unexplained_share
+from limbloc_ros.rig.consistency import (
+    Grid,
+    Mask,
+    core_of,
+    cover,
+    inside,
+    look_up,
+    score,
+    share_outside,
+    splat,
+    unexplained_share,
+)
 
 Array = NDArray[np.float64]
 
@@ -21,7 +32,7 @@ Array = NDArray[np.float64]
 Frame = Mapping[int, Mask]
 
 #: Candidates for the hull are thinned to this in a frame while a pose is searched.
-MOST_CANDIDATES = 15_000
+MOST_CANDIDATES = 8_000
 
 
 @dataclass(frozen=True)
@@ -145,12 +156,15 @@ def best_move(grid: Grid, frames: Sequence[Frame], camera: int) -> Move | None:
     # Where the mask's middle is and where it should be.
     offsets = [offset for case in cases if (offset := case.offset_px(grid, camera)) is not None]
     du, dv = np.median(offsets, axis=0) if offsets else (0.0, 0.0)
-    starts = [np.zeros(3), np.array([dv / focal, -du / focal, 0.0])]
+    starts = [np.zeros(3), np.array([dv / focal, -du / focal, 0.0])][: 1 if np.hypot(du, dv) < 1.5 else 2]
     step = 4.0 / focal
     turns = [_simplex(cost, start, step) for start in starts]
     turn = min(turns, key=lambda found: found[1])
-    both = _simplex(cost, np.concatenate([turn[0], np.zeros(3)]), step)
-    chosen, after = both if both[1] < 0.8 * turn[1] - 0.002 else turn
+    chosen, after = turn
+    if after > 0.2 * before:  # a turn does not explain it all
+        both = _simplex(cost, np.concatenate([turn[0], np.zeros(3)]), step)
+        if both[1] < 0.8 * after - 0.002:
+            chosen, after = both
     full = np.zeros(6)
     full[: len(chosen)] = chosen
     T = moved(full).T_world_camera
@@ -169,7 +183,7 @@ def best_move(grid: Grid, frames: Sequence[Frame], camera: int) -> Move | None:
 
 def _simplex(cost: object, start: Array, step: float) -> tuple[Array, float]:
     simplex = np.vstack([start, start + step * np.eye(len(start))])
-    options = {"initial_simplex": simplex, "maxfev": 60 * len(start), "xatol": 0.05 * step, "fatol": 1e-4}
+    options = {"initial_simplex": simplex, "maxfev": 40 * len(start), "xatol": 0.05 * step, "fatol": 1e-4}
     found = minimize(cost, start, method="Nelder-Mead", options=options)  # type: ignore[call-overload]
     return np.asarray(found.x), float(found.fun)
 
@@ -182,12 +196,14 @@ class _Case:
         frame: the masks.
         voxels, points: candidates, and their centres.
         pixels: of the other cameras: index -> where each sees the candidates.
+        cores: of all cameras: index -> the foreground without its rim.
     """
 
     frame: Frame
     voxels: NDArray[np.int64]
     points: Array
     pixels: dict[int, NDArray[np.int32]]
+    cores: dict[int, Mask]
 
     @staticmethod
     def make(grid: Grid, frame: Frame, camera: int) -> _Case | None:
@@ -203,7 +219,8 @@ class _Case:
         if len(voxels) < 20:
             return None
         voxels = voxels[:: -(-len(voxels) // MOST_CANDIDATES)]
-        return _Case(frame, voxels, grid.points[voxels], {c: grid.pixels[c][voxels] for c in others})
+        pixels = {c: grid.pixels[c][voxels] for c in others}
+        return _Case(frame, voxels, grid.points[voxels], pixels, {c: core_of(mask) for c, mask in frame.items()})
 
     def contradiction(self, grid: Grid, camera: int, trial: Camera) -> float:
         """The contradiction of all cameras when `camera` is `trial`."""
@@ -215,7 +232,7 @@ class _Case:
         for c, seen in {**self.pixels, camera: pixels}.items():
             mine = seen[kept]
             covered = splat(mine[mine >= 0], self.frame[c].shape, int(grid.reach[c]))
-            shares.append(unexplained_share(self.frame[c], covered))
+            shares.append(share_outside(self.cores[c], covered))
         return float(np.mean(shares))
 
     def offset_px(self, grid: Grid, camera: int) -> tuple[float, float] | None:
