@@ -123,12 +123,19 @@ def every_voxel(rig, masks, voxel_m, band_m, names):
     return indices, np.take_along_axis(rows, order, axis=0), order[0], unsure
 
 
-def assert_exact(rig, masks, voxel_m, band_m, keep_second=True):
+def assert_exact(rig, masks, voxel_m, band_m):
     """`evaluate` finds the very voxels and values; returns how many there are."""
-    config = HullConfig(voxel_m=voxel_m, band_m=band_m)
-    silhouettes = measured(rig, masks, config)
+    silhouettes = measured(rig, masks, HullConfig(voxel_m=voxel_m, band_m=band_m))
+    every = every_voxel(rig, masks, voxel_m, band_m, silhouettes.names)
+    without, all_of_them = (agree(silhouettes, rig, voxel_m, band_m, every, keep) for keep in (False, True))
+    assert without <= all_of_them
+    return all_of_them
+
+
+def agree(silhouettes, rig, voxel_m, band_m, every, keep_second):
+    """`evaluate` finds what `every_voxel` found; returns how many voxels there are."""
     found, first, second, who = evaluate(silhouettes, rig, voxel_m, band_m, keep_second)
-    indices, distances, largest, unsure = every_voxel(rig, masks, voxel_m, band_m, silhouettes.names)
+    indices, distances, largest, unsure = every[0], every[1], every[2], every[3].copy()
     assert unsure.mean() < 0.2
     seen = np.isfinite(distances).sum(axis=0)
     d1 = distances[0]
@@ -174,14 +181,12 @@ def random_rig(rng, lenses):
     return Rig(tuple(cameras), low + rng.uniform(-0.05, 0.05, 3), high), masks
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(12))
 def test_blocks_find_what_every_voxel_gives(seed):
     """Random cameras of all lenses, also inside the volume; random masks, also cut by the image's border."""
     rng = np.random.default_rng(seed)
     rig, masks = random_rig(rng, LENSES)
-    band = rng.uniform(0.03, 0.2)
-    for keep_second in (True, False):
-        assert_exact(rig, masks, rng.uniform(0.1, 0.2), band, keep_second)
+    assert_exact(rig, masks, rng.uniform(0.1, 0.2), rng.uniform(0.03, 0.2))
 
 
 @pytest.mark.parametrize("lens", LENSES)
@@ -199,7 +204,7 @@ def test_distorted_cameras_are_exact(lens):
     assert assert_exact(rig, masks, 0.1, 0.1) > 200
 
 
-@pytest.mark.parametrize("count", range(2, 17))
+@pytest.mark.parametrize("count", [2, 3, 4, 5, 6, 7, 8, 11, 16])
 def test_two_to_sixteen_cameras(count):
     rig = ring(count)
     masks = ball_masks(rig, [((0.1, 0.0, 1.0), 0.4)])
@@ -209,7 +214,7 @@ def test_two_to_sixteen_cameras(count):
 
 
 def test_changed_masks_are_evaluated_again_as_if_from_scratch():
-    for seed in range(8):
+    for seed in range(5):
         rng = np.random.default_rng(seed)
         rig, masks = random_rig(rng, LENSES)
         config = HullConfig(voxel_m=0.08, band_m=0.12)

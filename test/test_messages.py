@@ -15,6 +15,7 @@ from std_msgs.msg import Header
 from visualization_msgs.msg import Marker
 
 from limbloc_ros.core.camera import Camera
+from limbloc_ros.core.engine_robust import outline_rays
 from limbloc_ros.core.errors import InputError, RigError
 from limbloc_ros.core.hull import NOBODY, Hull
 from limbloc_ros.core.pose import JOINT, JOINT_NAMES, STICK_BONES, Flesh, Pose
@@ -346,6 +347,22 @@ def test_who_cut_the_hull_comes_back_bit_for_bit() -> None:
     assert back.cut_by.tobytes() == hull.cut_by.tobytes()
     for camera in (0, 1, 3, 4):
         assert back.viewpoints[camera].tobytes() == viewpoints[camera].tobytes()
+
+
+def test_outline_rays_are_the_same_live_as_offline() -> None:
+    hull = ball(0.05, 0.5)
+    rng = np.random.default_rng(1)
+    rows = np.where(hull.sdf < np.float32(hull.band_m), rng.integers(0, 3, hull.sdf.shape), NOBODY).astype(np.uint8)
+    viewpoints = rng.normal(0, 3, (4, 3)).astype(np.float32)
+    hull = dataclasses.replace(hull, cut_by=rows, viewpoints=viewpoints)
+    back = cloud_to_hull(hull_to_cloud(hull, HEADER))
+    assert back is not None
+    here, there = (
+        outline_rays(one, surface, np.arange(len(surface)))
+        for one, surface in ((hull, extract_surface(hull)), (back, extract_surface(back)))
+    )
+    assert np.linalg.norm(here, axis=1).min() > 0.99
+    np.testing.assert_array_equal(here, there)
 
 
 def test_a_hull_of_which_nobody_knows_who_cut_it() -> None:
