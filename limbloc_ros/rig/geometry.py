@@ -47,6 +47,18 @@ def inverse(T: Array) -> Array:
     return out
 
 
+def looking_at(centre: Array, target: Array) -> Array:
+    """T_world_camera [4, 4] of an upright camera at `centre` [3] that looks at `target` [3]."""
+    forward = target - centre
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    T = np.eye(4)
+    T[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
+    T[:3, 3] = centre
+    return T
+
+
 def where_they_look(poses: Sequence[Array]) -> Look:
     """Where cameras look, of their poses T_world_camera [4, 4]; in the poses' unit."""
     origins = np.array([T[:3, 3] for T in poses])

@@ -16,6 +16,7 @@ from limbloc_ros.core.config import HullConfig
 from limbloc_ros.core.errors import ConfigError, NoPerson
 from limbloc_ros.core.hull import Hull, carve
 from limbloc_ros.rig.consistency import look_up
+from limbloc_ros.rig.geometry import looking_at
 from limbloc_ros.rig.volume import derive_volume
 
 Array = NDArray[np.float64]
@@ -116,14 +117,7 @@ def propose(
         reach = float((half / np.maximum(np.abs(direction), 1e-9)).min())
         top = height - FROM_CEILING_M if k % 2 == 0 else min(LOW_M, height - FROM_CEILING_M)
         centre = np.array([*(reach * direction), top])
-        forward = np.array([0.0, 0.0, AIM_M]) - centre
-        forward /= np.linalg.norm(forward)
-        right = np.cross(forward, [0.0, 0.0, 1.0])
-        right /= np.linalg.norm(right)
-        T = np.eye(4)
-        T[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
-        T[:3, 3] = centre
-        cameras.append(Camera(f"cam{k}", size[0], size[1], K, T))
+        cameras.append(Camera(f"cam{k}", size[0], size[1], K, looking_at(centre, np.array([0.0, 0.0, AIM_M]))))
     low, high = derive_volume(cameras)
     inner = np.array([length, width]) / 2
     low[:2], high[:2] = np.maximum(low[:2], -inner), np.minimum(high[:2], inner)

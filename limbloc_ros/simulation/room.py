@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from limbloc_ros.core.camera import Camera, Rig
 from limbloc_ros.core.errors import ConfigError, RigError
+from limbloc_ros.rig.geometry import looking_at
 from limbloc_ros.simulation import _render_kernels as kernels
 from limbloc_ros.simulation.motion import Motion
 from limbloc_ros.simulation.person import Person, PosedPerson, load_person
@@ -67,13 +68,7 @@ def default_rig(n_cameras: int = 8, width: int = 640, height: int = 480) -> Rig:
         centre = np.array(
             [_RING_M * math.cos(angle), _RING_M * math.sin(angle), _HEIGHTS_M[(k + shift) % len(_HEIGHTS_M)]]
         )
-        forward = np.array([0.0, 0.0, 0.95]) - centre
-        forward /= np.linalg.norm(forward)
-        right = np.cross(forward, [0.0, 0.0, 1.0])
-        right /= np.linalg.norm(right)
-        T = np.eye(4)
-        T[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
-        T[:3, 3] = centre
+        T = looking_at(centre, np.array([0.0, 0.0, 0.95]))
         focal = 0.62 * max(width, height * 4 / 3) * (1 + 0.012 * math.sin(2.3 * k))
         K = np.array(
             [
