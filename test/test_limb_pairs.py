@@ -228,24 +228,6 @@ def nothing_cut_short(monkeypatch):
     monkeypatch.setattr(limb_pairs, "OVERLAP_M", 0.0)
 
 
-@pytest.fixture
-def seats_that_stay(monkeypatch):
-    """A figure whose seat does not reach down to the thighs: there a part of the body rides on the legs."""
-    parts = figure.PART_SPHERES.copy()
-    for side in "LR":
-        parts[parts == figure.SPHERE[f"thigh_top_{side}"]] = figure.SPHERE[f"hip_{side}"]
-    rows = [p for p, name in enumerate(figure.PART_NAMES) if name.startswith(("thigh", "shin", "foot"))]
-    parts[rows] = figure.PART_SPHERES[rows]
-    assert (parts != figure.PART_SPHERES).sum() == 2
-    monkeypatch.setattr(figure, "PART_SPHERES", parts)
-    samples, sampled = energy._inclusion_samples()
-    monkeypatch.setattr(energy, "INCLUSION_SAMPLES", samples)
-    monkeypatch.setattr(energy, "INCLUSION_PARTS", sampled)
-    limb_pairs._limb_table.cache_clear()
-    yield
-    limb_pairs._limb_table.cache_clear()
-
-
 def costs_of_pairs(person, kind, limbs, evidence, weights):
     """What limb_pairs says of all pairs, and the energies of the figures with those limbs."""
     count = len(limbs[0].found) * len(limbs[1].found)
@@ -266,7 +248,7 @@ BENT = Weights(penetration=0.0, posture=0.0, limits=0.0, spine=0.0)
 
 @KINDS
 @pytest.mark.parametrize("rays", [False, True], ids=["points", "rays"])
-def test_pairs_differ_as_whole_figures_do(person, kind, rays, nothing_cut_short, seats_that_stay):
+def test_pairs_differ_as_whole_figures_do(person, kind, rays, nothing_cut_short):
     """With nothing cut short the energies of two pairs differ by what the whole figures' energies differ."""
     rng = np.random.default_rng(5)
     evidence = even_evidence(person, 300, rng, rays)
@@ -274,15 +256,6 @@ def test_pairs_differ_as_whole_figures_do(person, kind, rays, nothing_cut_short,
     mine, whole = costs_of_pairs(person, kind, limbs, evidence, BENT)
     assert np.ptp(whole) > 5e-4
     np.testing.assert_allclose(mine - mine[0], whole - whole[0], atol=1e-9 * np.ptp(whole))
-
-
-def test_pairs_of_legs_leave_out_that_the_seat_rides_on_them(person, nothing_cut_short):
-    rng = np.random.default_rng(5)
-    evidence = even_evidence(person, 300, rng, True)
-    limbs = [random_limbs(person, LEG, side, rng, 5) for side in "LR"]
-    mine, whole = costs_of_pairs(person, LEG, limbs, evidence, BENT)
-    np.testing.assert_allclose(mine - mine[0], whole - whole[0], atol=0.2 * np.ptp(whole))
-    assert whole[0] == whole.min()
 
 
 def test_an_arm_in_the_trunk_costs_what_it_costs_the_whole_figure(person, nothing_cut_short):

@@ -99,9 +99,39 @@ def nearest_part(
     return best, best_part
 
 
+@njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def radius_slope(ray: Any, part: Any, spheres: Any, radii: Any, out: Any) -> None:
+    """Minus the gradient of the radius over the triangle of a part's spheres, seen along a ray; [3], 0 if degenerate."""
+    u = np.empty(3)
+    v = np.empty(3)
+    for i in range(3):
+        u[i] = spheres[part[1], i] - spheres[part[0], i]
+        v[i] = spheres[part[2], i] - spheres[part[0], i]
+    along_u = u[0] * ray[0] + u[1] * ray[1] + u[2] * ray[2]
+    along_v = v[0] * ray[0] + v[1] * ray[1] + v[2] * ray[2]
+    uu = 0.0
+    uv = 0.0
+    vv = 0.0
+    for i in range(3):
+        u[i] -= along_u * ray[i]
+        v[i] -= along_v * ray[i]
+        uu += u[i] * u[i]
+        uv += u[i] * v[i]
+        vv += v[i] * v[i]
+    det = uu * vv - uv * uv
+    rb = radii[part[1]] - radii[part[0]]
+    rc = radii[part[2]] - radii[part[0]]
+    for i in range(3):
+        out[i] = -((vv * rb - uv * rc) * u[i] + (uu * rc - uv * rb) * v[i]) / det if det > 1e-10 else 0.0
+
+
 @njit(cache=True, inline="always", error_model="numpy")  # type: ignore[misc, unused-ignore]
 def offset_from(point: Any, ray: Any, part: Any, w: Any, spheres: Any, radii: Any, out: Any) -> float:
-    """Signed distance of a point (or its ray) to one sphere of a part, its direction away from there in `out` [3]."""
+    """Signed distance of a point (or its ray) to one sphere of a part; how it falls with that sphere's place in `out`.
+
+    That is the direction from the sphere to the point. But a ray that runs through the triangle of three spheres, as it
+    does where the trunk is seen, meets the sphere's very centre: there the distance is the radius, whose slope counts.
+    """
     r = 0.0
     out[0] = 0.0
     out[1] = 0.0
@@ -114,9 +144,12 @@ def offset_from(point: Any, ray: Any, part: Any, w: Any, spheres: Any, radii: An
     along = out[0] * ray[0] + out[1] * ray[1] + out[2] * ray[2]
     for i in range(3):
         out[i] -= along * ray[i]
-    length = math.sqrt(out[0] * out[0] + out[1] * out[1] + out[2] * out[2]) + 1e-12
-    for i in range(3):
-        out[i] /= length
+    length = math.sqrt(out[0] * out[0] + out[1] * out[1] + out[2] * out[2])
+    if length > 1e-9:
+        for i in range(3):
+            out[i] /= length
+    else:
+        radius_slope(ray, part, spheres, radii, out)
     return length - r
 
 

@@ -54,8 +54,8 @@ def _limb_table(kind: LimbKind, side: str) -> _LimbTable:
     bones = tuple(BONE[f"{name}_{side}"] for name in kind.bones)
     carried = figure.proportions().point_bones[: figure.N_SPHERES]
     spheres = np.flatnonzero(np.isin(carried, bones))
-    names = {f"{name}_{side}" for name in kind.bones}
-    parts = np.array([p for p, name in enumerate(figure.PART_NAMES) if name in names])
+    # with the seat, a part of the pelvis that rides on the thigh
+    parts = np.flatnonzero(np.isin(figure.PART_SPHERES, spheres).any(axis=1))
     sampled = np.isin(energy.INCLUSION_PARTS, parts)
     other = {f"{name}_{'R' if side == 'L' else 'L'}" for name in kind.bones}
     against = [p for p, name in enumerate(figure.PART_NAMES) if name not in other]
@@ -116,7 +116,7 @@ def limb_pairs(
         placed: the figure.
         left, right: candidates.
         kind: ARM or LEG.
-        body: indices of the parts that are believed already.
+        body: indices of the parts that are believed already; those that move with the limbs are left out.
         evidence, weights: the energy's.
         keep: how many pairs to return; they differ by APART_M in some limb's end.
 
@@ -126,6 +126,7 @@ def limb_pairs(
     if len(left.found) == 0 or len(right.found) == 0:
         return []
     w = weights
+    body = np.setdiff1d(body, np.concatenate([_limb_table(kind, side).parts for side in "LR"]))
     surface = np.array([w.surface_width_m, w.normal_gate_m, w.surface_inside])
     scene = (evidence.points, evidence.normals, evidence.rays)
     gap, costs = kernels.body_fit(*scene, figure.PART_SPHERES[body], placed.spheres, placed.radii, surface)

@@ -89,6 +89,6 @@ class Tracker:
         for state in with_arms(result.state, scene, self.ARM_PAIRS):
             settled = refine(state, scene.quick, scene.lenient, 5).state
             other = refine(settled, self._evidence(hull, surface), self._weights, 8)
-            if other.system.cost < 0.97 * best.system.cost:
+            if other.system.cost < 0.94 * best.system.cost:
                 best = other
         return best
