@@ -101,7 +101,7 @@ def nearest_part(
 
 @njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def radius_slope(ray: Any, part: Any, spheres: Any, radii: Any, out: Any) -> None:
-    """Minus the gradient of the radius over the triangle of a part's spheres, seen along a ray; [3], 0 if degenerate."""
+    """Minus the gradient of the radius over the triangle of a part's spheres, seen along a ray; [3]; 0 on a line."""
     u = np.empty(3)
     v = np.empty(3)
     for i in range(3):

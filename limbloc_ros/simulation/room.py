@@ -296,7 +296,7 @@ class SimulatedRoom:
 
 
 def _image_box(uv: Array, depth: Array, near: float, camera: Camera) -> tuple[int, int, int, int] | None:
-    """x0, y0, x1, y1 within the image, with a margin, around the points deeper than `near` m; None if there are none."""
+    """x0, y0, x1, y1 within the image, with a margin, around the points deeper than `near` m; None for no point."""
     some, u0, v0, u1, v1 = kernels.bounds(uv, depth, near)
     if not some:
         return None
