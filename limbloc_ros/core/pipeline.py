@@ -90,7 +90,7 @@ class PoseEstimator:
         """Compile or load every kernel, so that the first frame is not slow."""
         hull = Carver(*_warm_up_room()).carve(_warm_up_masks())
         assert isinstance(hull, Hull)
-        # The first frame is searched from scratch, as every frame alone is; the second follows.
+        # The first frame is searched from scratch, with the kernels of every frame alone; the second follows.
         estimator = PoseEstimator(FitConfig(temporal=True))
         estimator.estimate(hull)
         estimator.estimate(hull)
