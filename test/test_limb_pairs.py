@@ -376,3 +376,32 @@ def test_nothing_left_to_explain(person, monkeypatch):
     limbs = [random_limbs(person, ARM, side, rng, 6) for side in "LR"]
     pairs = limb_pairs.limb_pairs(person.placed, *limbs, ARM, body_without(ARM), evidence, Weights(), 1)
     assert pairs[0][:2] == (0, 0)  # the true ones stick out of the hull least
+
+
+@KINDS
+@pytest.mark.parametrize("side", "LR")
+def test_one_limb_is_chosen_by_the_energy_of_the_whole_figure(person, kind, side, nothing_cut_short):
+    rng = np.random.default_rng(8)
+    evidence = even_evidence(person, 300, rng, True)
+    limbs = random_limbs(person, kind, side, rng, 12)
+    names = {f"{name}_{side}" for name in kind.bones}
+    body = np.array([p for p, name in enumerate(figure.PART_NAMES) if name not in names])
+    rows = limb_pairs.best_limbs(person.placed, limbs, kind, side, body, evidence, BENT, 12)
+    states = [with_limb(person.state, person.placed, kind, side, limb) for limb in limbs.found]
+    costs = [energy.system(state, evidence, BENT).cost for state in states]
+    assert np.ptp(costs) > 1e-4
+    assert rows == np.argsort(costs).tolist()
+
+
+def test_places_for_one_limb_lie_apart(person):
+    rng = np.random.default_rng(9)
+    evidence = even_evidence(person, 100, rng, False)
+    limbs = random_limbs(person, ARM, "L", rng, 30)
+    body = np.arange(figure.N_PARTS)
+    rows = limb_pairs.best_limbs(person.placed, limbs, ARM, "L", body, evidence, BENT, 5)
+    assert len(rows) == len(set(rows)) == 5
+    ends = limbs.found[rows, 3:6]
+    gaps = np.linalg.norm(ends[:, None] - ends, axis=2)[np.triu_indices(5, 1)]
+    assert gaps.min() >= limb_pairs.APART_M
+    none = dataclasses.replace(limbs, found=np.empty((0, 7)))
+    assert limb_pairs.best_limbs(person.placed, none, ARM, "L", body, evidence, BENT, 5) == []

@@ -449,7 +449,8 @@ def test_the_simulated_room_runs_under_the_supervisor_and_can_be_recorded(tmp_pa
     assert [p.name for p in plans] == ["simulated", "cameras_1", "cameras_2", "record"]
     lines = Lines()
     with Supervisor(plans, graph_environment(config.network), FAST, lines.append) as supervisor:
-        lines.wait_for(supervisor, "recording /true_joints")
+        for topic in ("/true_joints", "/cam0/mask/compressed", "/cam1/mask/compressed"):
+            lines.wait_for(supervisor, f"recording {topic}")
         end = time.monotonic() + 2.0
         while time.monotonic() < end:
             assert supervisor.poll()

@@ -12,7 +12,7 @@ from limbloc_ros.core import energy, figure, lm, search
 from limbloc_ros.core.energy import Evidence, Weights
 from limbloc_ros.core.figure import FigureState
 from limbloc_ros.core.hull import Hull
-from limbloc_ros.core.limb_pairs import limb_pairs, with_limb
+from limbloc_ros.core.limb_pairs import best_limbs, limb_pairs, with_limb
 from limbloc_ros.core.search import ARM, LEG, Medial
 from limbloc_ros.core.surface import Surface
 
@@ -30,6 +30,9 @@ class Effort:
         starts: figures with legs and arms, of all these, that are refined.
         survivors, repaired: of these, so many are refined further, and so many get their limbs looked for again ...
         arm_repairs, leg_repairs: ... with so many other pairs of arms, and of legs and arms.
+        strict: so many are refined under strict joint limits.
+        single_arms, single_legs, rounds: other places that are tried for each limb of the winner, and how many rounds
+            of that at most.
         finalists: so many are refined on all points; the one of lowest energy is the result.
         quick_points, points: surface points until then, and then.
         iterations: most steps of the refinements: first, survivors, repairs, under strict limits, final.
@@ -40,10 +43,13 @@ class Effort:
     leg_pairs: int = 3
     starts: int = 10
     survivors: int = 4
-    repaired: int = 3
+    repaired: int = 1
     arm_repairs: int = 3
     leg_repairs: int = 1
     strict: int = 4
+    single_arms: int = 4
+    single_legs: int = 2
+    rounds: int = 2
     finalists: int = 2
     quick_points: int = 350
     points: int = 1000
@@ -52,10 +58,8 @@ class Effort:
 
 
 #: Tried when the energy (m^2) stays above DOUBTFUL_COST.
-HARDER = Effort(torsos=14, leg_pairs=4, starts=24, survivors=8, repaired=4)
+HARDER = Effort(torsos=14, leg_pairs=4, starts=24, survivors=8, repaired=3)
 DOUBTFUL_COST = 5e-4
-#: Below this energy (m^2) only the best candidate's limbs are looked for again.
-EASY_COST = 2.2e-4
 #: Figures of up to so many times the least energy are rivals.
 RIVAL_COST = 1.5
 
@@ -173,6 +177,18 @@ def _with_pairs(
     return out or [state]
 
 
+def with_one_limb(state: FigureState, scene: Scene, kind: search.LimbKind, side: str, keep: int) -> list[FigureState]:
+    """The figure with each of the best places for one limb, all others where they are."""
+    placed = figure.place(state)
+    names = {f"{bone}_{side}" for bone in kind.bones}
+    body = np.array([p for p, name in enumerate(figure.PART_NAMES) if name not in names])
+    solid = body if kind is ARM else search.UPPER_TRUNK_PARTS
+    taken = search.explained_volume(scene.hull, placed, solid)
+    limbs = search.limb_candidates(scene.hull, scene.medial, placed, kind, side, taken, CANDIDATES)
+    rows = best_limbs(placed, limbs, kind, side, body, scene.quick, scene.lenient, keep)
+    return [with_limb(state, placed, kind, side, limbs.found[row]) for row in rows]
+
+
 def make_scene(hull: Hull, surface: Surface, seed: int, weights: Weights, effort: Effort) -> Scene:
     """What the search reads of a hull."""
     rng = np.random.default_rng(seed)
@@ -225,8 +241,7 @@ def _fit_from_torsos(torsos: list[FigureState], scene: Scene, effort: Effort) ->
     tried = [refine(state, quick, lenient, first) for state in _cheapest(starts, scene, effort.starts)]
     tried = [refine(r.state, quick, lenient, second) for r in _best(tried, effort.survivors)]
     # With the trunk in place and sizes adapted, limbs are looked for once more.
-    best = _best(tried, effort.repaired)
-    for candidate in best[:1] if best[0].system.cost < EASY_COST else best:
+    for candidate in _best(tried, effort.repaired):
         others = with_arms(candidate.state, scene, effort.arm_repairs)
         others += _cheapest(_with_limbs([candidate.state], scene, effort.leg_pairs), scene, effort.leg_repairs)
         tried += [refine(state, quick, lenient, repair) for state in others]
@@ -235,7 +250,27 @@ def _fit_from_torsos(torsos: list[FigureState], scene: Scene, effort: Effort) ->
     tried = [refine(r.state, quick, scene.weights, strict) for r in _best(tried, effort.strict)]
     finals = [refine(r.state, scene.full, scene.weights, final) for r in _best(tried, effort.finalists)]
     winner = _best(finals, 1)[0]
+    for _ in range(effort.rounds):
+        before = winner.system.cost
+        for kind, places in ((ARM, effort.single_arms), (LEG, effort.single_legs)):
+            for side in "LR":
+                winner = _with_better_limb(winner, scene, kind, side, places, effort)
+        if winner.system.cost == before:
+            break
     return Fit(winner.state, winner.system, rivals)
+
+
+def _with_better_limb(
+    winner: Refined, scene: Scene, kind: search.LimbKind, side: str, places: int, effort: Effort
+) -> Refined:
+    """The winner, or it with one limb elsewhere if that explains the hull better: trunk and sizes are known by now."""
+    _, _, repair, strict, final = effort.iterations
+    for state in with_one_limb(winner.state, scene, kind, side, places):
+        settled = refine(state, scene.quick, scene.lenient, repair).state
+        other = refine(settled, scene.full, scene.weights, strict)
+        if other.system.cost < winner.system.cost:
+            winner = refine(other.state, scene.full, scene.weights, final)
+    return winner
 
 
 def _with_limbs(states: list[FigureState], scene: Scene, leg_pairs: int) -> list[FigureState]:

@@ -126,18 +126,9 @@ def limb_pairs(
     if len(left.found) == 0 or len(right.found) == 0:
         return []
     w = weights
-    body = np.setdiff1d(body, np.concatenate([_limb_table(kind, side).parts for side in "LR"]))
-    surface = np.array([w.surface_width_m, w.normal_gate_m, w.surface_inside])
-    scene = (evidence.points, evidence.normals, evidence.rays)
-    gap, costs = kernels.body_fit(*scene, figure.PART_SPHERES[body], placed.spheres, placed.radii, surface)
-    # what the body explains well no limb can explain much better
-    rows = np.flatnonzero(costs > EXPLAINED_M**2)
-    share = w.surface * float(evidence.point_weights[rows].sum())
-    rows = rows[:: -(-len(rows) // MOST_POINTS) or 1]
-    point_weight = share / max(len(rows), 1)
-    scene = scene[0][rows], scene[1][rows], scene[2][rows]
-    gap, costs = np.minimum(gap[rows], REACH_M), costs[rows]
-    fits = [_fits(placed, limbs, kind, side, scene, evidence, w, gap) for limbs, side in ((left, "L"), (right, "R"))]
+    question = _open_question(placed, kind, ("L", "R"), body, evidence, w)
+    fits = [_fits(placed, limbs, kind, side, question, evidence, w) for limbs, side in ((left, "L"), (right, "R"))]
+    costs, point_weight = question.costs, question.point_weight
     best = [kernels.best_alone(*fit, costs, point_weight, PAIRED) for fit in fits]
     pairs = kernels.best_pairs(
         left.found, right.found, *fits[0], *fits[1], costs, point_weight, *best,
@@ -146,15 +137,62 @@ def limb_pairs(
     return [(int(a), int(b), float(cost)) for a, b, cost in pairs]
 
 
+def best_limbs(
+    placed: Placed, limbs: Limbs, kind: LimbKind, side: str, body: Ints, evidence: Evidence, weights: Weights, keep: int
+) -> list[int]:
+    """Candidates for one limb of lowest energy together with the rest of the figure, the other limb included.
+
+    Args:
+        placed, kind, body, evidence, weights: as in `limb_pairs`.
+        limbs: candidates.
+        side: `L` or `R`.
+        keep: how many to return; their ends lie APART_M apart.
+    """
+    if len(limbs.found) == 0:
+        return []
+    question = _open_question(placed, kind, (side,), body, evidence, weights)
+    fit = _fits(placed, limbs, kind, side, question, evidence, weights)
+    chosen: list[int] = []
+    for row in kernels.best_alone(*fit, question.costs, question.point_weight, len(limbs.found)):
+        ends = limbs.found[chosen, 3:6] - limbs.found[row, 3:6]
+        if len(chosen) < keep and (np.linalg.norm(ends, axis=1) >= APART_M).all():
+            chosen.append(int(row))
+    return chosen
+
+
+@dataclass(frozen=True)
+class _OpenQuestion:
+    """The surface points that the body leaves to the limbs: themselves, how near the body is, and what they cost so."""
+
+    scene: tuple[Array, Array, Array]
+    gap: Array
+    costs: Array
+    point_weight: float
+
+
+def _open_question(
+    placed: Placed, kind: LimbKind, sides: tuple[str, ...], body: Ints, evidence: Evidence, w: Weights
+) -> _OpenQuestion:
+    body = np.setdiff1d(body, np.concatenate([_limb_table(kind, side).parts for side in sides]))
+    surface = np.array([w.surface_width_m, w.normal_gate_m, w.surface_inside])
+    scene = (evidence.points, evidence.normals, evidence.rays)
+    gap, costs = kernels.body_fit(*scene, figure.PART_SPHERES[body], placed.spheres, placed.radii, surface)
+    # what the body explains well no limb can explain much better
+    rows = np.flatnonzero(costs > EXPLAINED_M**2)
+    share = w.surface * float(evidence.point_weights[rows].sum())
+    rows = rows[:: -(-len(rows) // MOST_POINTS) or 1]
+    asked = scene[0][rows], scene[1][rows], scene[2][rows]
+    return _OpenQuestion(asked, np.minimum(gap[rows], REACH_M), costs[rows], share / max(len(rows), 1))
+
+
 def _fits(
     placed: Placed,
     limbs: Limbs,
     kind: LimbKind,
     side: str,
-    scene: tuple[Array, Array, Array],
+    question: _OpenQuestion,
     evidence: Evidence,
     w: Weights,
-    body_gap: Array,
 ) -> tuple[Array, Array, Array]:
     table = _limb_table(kind, side)
     first, second, third = table.bones
@@ -167,12 +205,12 @@ def _fits(
     )
     carrier = np.array(table.bones)[table.sphere_bones]
     offsets = np.einsum("nji,nj->ni", rotations[carrier], placed.spheres[table.spheres] - origins[carrier])
-    count = len(limbs.found)
-    gaps, costs, own = np.empty((count, len(body_gap))), np.empty((count, len(body_gap))), np.empty(count)
+    count, asked = len(limbs.found), len(question.gap)
+    gaps, costs, own = np.empty((count, asked)), np.empty((count, asked)), np.empty(count)
     kernels.limb_fits(
         limbs.found, origins[first], rotations[figure.PARENTS[first]], _hinge_rest(kind, first), table.sign, joints,
         table.spheres, table.sphere_bones, offsets, placed.spheres.copy(), placed.radii, figure.PART_SPHERES,
-        figure.PART_SPHERES[table.parts], *scene, body_gap,
+        figure.PART_SPHERES[table.parts], *question.scene, question.gap,
         np.array([w.surface_width_m, w.normal_gate_m, w.surface_inside]),
         table.samples, table.sample_parts, evidence.sdf, evidence.origin, evidence.voxel_m,
         np.array([w.inclusion_slack_m, w.inclusion_width_m, w.inclusion]), table.penetration,

@@ -30,7 +30,7 @@ class Tracker:
     #: live room a slow fit makes the next step longer. Arms are checked as often.
     PATIENCE = 8
     #: What is searched when starting anew: less than for a frame alone, for the next frames can mend it.
-    SEARCH = Effort(leg_pairs=2, starts=6, survivors=3, repaired=1)
+    SEARCH = Effort(leg_pairs=2, starts=6, survivors=3, single_arms=2, single_legs=0, rounds=1)
     #: Other pairs of arms that are tried when arms are checked.
     ARM_PAIRS = 2
     #: Surface points that a figure is carried along on.
