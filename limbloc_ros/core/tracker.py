@@ -27,14 +27,15 @@ class Tracker:
     #: A cost this much above the usual one, or above this many m^2, is no longer believed ...
     DOUBT, DOUBTFUL_COST = 1.35, 4.5e-4
     #: ... but starting anew, which takes as long as many followed frames, is tried only every so many frames: in a
-    #: live room a slow fit makes the next step longer. Arms are checked as often.
-    PATIENCE = 8
+    #: live room a slow fit makes the next step longer. Arms are checked as often. Each time that starting anew finds
+    #: nothing better, the wait doubles, up to this: some hulls are just bad.
+    PATIENCE, LONGEST_WAIT = 8, 32
     #: What is searched when starting anew: less than for a frame alone, for the next frames can mend it.
     SEARCH = Effort(leg_pairs=2, starts=6, survivors=3, single_arms=2, single_legs=0, rounds=1)
     #: Other pairs of arms that are tried when arms are checked.
     ARM_PAIRS = 2
     #: Surface points that a figure is carried along on.
-    POINTS = 600
+    POINTS = 450
 
     def __init__(self, seed: int, weights: Weights | None = None, effort: Effort | None = None) -> None:
         self._seed, self._weights, self._effort = seed, weights or Weights(), effort or self.SEARCH
@@ -46,6 +47,7 @@ class Tracker:
         self._usual_cost = 0.0
         self._frame = 0
         self._last_scratch = -self.PATIENCE
+        self._wait = self.PATIENCE
         self._centre = np.zeros(3)
 
     def follow(self, hull: Hull, surface: Surface) -> Fit | None:
@@ -65,7 +67,9 @@ class Tracker:
             self._last_scratch = self._frame
             scratch = fit_from_scratch(hull, surface, self._seed, self._weights, self._effort, None)
             if scratch is not None and (fit is None or scratch.system.cost < 0.95 * fit.system.cost):
-                fit = scratch
+                fit, self._wait = scratch, self.PATIENCE
+            else:
+                self._wait = min(2 * self._wait, self.LONGEST_WAIT)
         if fit is None:
             self._last = None
             return None
@@ -79,7 +83,7 @@ class Tracker:
         return gather_evidence(hull, surface, self.POINTS, np.random.default_rng(self._seed))
 
     def _doubts(self, cost: float) -> bool:
-        waited = self._frame - self._last_scratch >= self.PATIENCE
+        waited = self._frame - self._last_scratch >= self._wait
         return waited and (cost > self.DOUBT * self._usual_cost or cost > self.DOUBTFUL_COST)
 
     def _check_arms(self, result: lm.LmResult[FigureState], hull: Hull, surface: Surface) -> lm.LmResult[FigureState]:

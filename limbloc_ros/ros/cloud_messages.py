@@ -50,7 +50,7 @@ _SURFACE_FIELDS = _fields(SURFACE_POINT)
 
 def _cloud(points: NDArray[np.void], fields: list[PointField], header: Header) -> PointCloud2:
     data = array("B")
-    data.frombytes(points.tobytes())
+    data.frombytes(points.view(np.uint8).data)
     return PointCloud2(
         header=header,
         height=1,
@@ -97,7 +97,7 @@ def hull_to_cloud(hull: Hull, header: Header) -> PointCloud2:
     points["voxel_um"] = round(hull.voxel_m * 1e6)
     points["band_um"] = round(hull.band_m * 1e6)
     points["camera"] = NOBODY
-    if hull.cut_by is not None:
+    if hull.cut_by is not None and len(hull.viewpoints):
         cut_by = hull.cut_by[hull.sdf < np.float32(hull.band_m)]
         known = cut_by < len(hull.viewpoints)
         points["camera"] = np.where(known, cut_by, NOBODY)
