@@ -31,7 +31,9 @@ class Tracker:
     #: nothing better, the wait doubles, up to this: some hulls are just bad.
     PATIENCE, LONGEST_WAIT = 8, 32
     #: What is searched when starting anew: less than for a frame alone, for the next frames can mend it.
-    SEARCH = Effort(leg_pairs=2, starts=6, survivors=3, single_arms=2, single_legs=0, rounds=1)
+    SEARCH = Effort(
+        leg_pairs=2, starts=6, survivors=3, arm_repairs=2, strict=2, finalists=1, single_arms=2, single_legs=0, rounds=1
+    )
     #: Other pairs of arms that are tried when arms are checked.
     ARM_PAIRS = 2
     #: Surface points that a figure is carried along on.
