@@ -146,7 +146,7 @@ class Stand:
         cost = self.costs.get(self.frame, 1e-4)
         return SimpleNamespace(state=FigureState.standing(state.root), system=SimpleNamespace(cost=cost))
 
-    def check(self, result, hull, surface):
+    def check(self, result, hull, surface, evidence):
         self.checked.append(self.frame)
         return result
 

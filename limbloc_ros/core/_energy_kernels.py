@@ -55,6 +55,22 @@ def sample_sdf(sdf: Any, origin: Any, voxel: float, x: float, y: float, z: float
     return v0 + a * (v1 - v0)  # type: ignore[no-any-return]
 
 
+@njit(cache=True, inline="always", error_model="numpy")  # type: ignore[misc, unused-ignore]
+def blended_sphere(w: Any, part: Any, spheres: Any, radii: Any) -> tuple[float, float, float, float]:
+    """Centre and radius of the sphere with barycentric weights w [3] within a part."""
+    x = 0.0
+    y = 0.0
+    z = 0.0
+    r = 0.0
+    for k in range(3):
+        s = part[k]
+        x += w[k] * spheres[s, 0]
+        y += w[k] * spheres[s, 1]
+        z += w[k] * spheres[s, 2]
+        r += w[k] * radii[s]
+    return x, y, z, r
+
+
 @njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def inclusion_term(
     samples: Any,
@@ -80,16 +96,7 @@ def inclusion_term(
     cost = 0.0
     for m in range(len(samples)):
         p = sample_parts[m]
-        x = 0.0
-        y = 0.0
-        z = 0.0
-        r = 0.0
-        for k in range(3):
-            s = parts[p, k]
-            x += samples[m, k] * spheres[s, 0]
-            y += samples[m, k] * spheres[s, 1]
-            z += samples[m, k] * spheres[s, 2]
-            r += samples[m, k] * radii[s]
+        x, y, z, r = blended_sphere(samples[m], parts[p], spheres, radii)
         e = sample_sdf(sdf, origin, voxel, x, y, z, grad) + r - slack
         if e <= 0.0:
             continue

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from limbloc_ros.core._energy_kernels import sample_sdf
+from limbloc_ros.core._energy_kernels import blended_sphere, sample_sdf
 from limbloc_ros.core._figure_kernels import log_so3, part_bounds, part_distance
 from limbloc_ros.core._surface_fit_kernels import nearest_part, offset_from, robust_weight
 
@@ -184,17 +184,7 @@ def limb_fits(
             costs[m, q] = c * (surface[2] if d < 0.0 else 1.0)
         cost = 0.0
         for n in range(len(samples)):
-            at = sample_parts[n]
-            x = 0.0
-            y = 0.0
-            z = 0.0
-            r = 0.0
-            for k in range(3):
-                s = all_parts[at, k]
-                x += samples[n, k] * spheres[s, 0]
-                y += samples[n, k] * spheres[s, 1]
-                z += samples[n, k] * spheres[s, 2]
-                r += samples[n, k] * radii[s]
+            x, y, z, r = blended_sphere(samples[n], all_parts[sample_parts[n]], spheres, radii)
             e = sample_sdf(sdf, origin, voxel, x, y, z, away) + r - inclusion[0]
             if e > 0.0:
                 c, _ = robust_weight(e, inclusion[1])

@@ -59,11 +59,11 @@ class Tracker:
         centre = surface.points.mean(axis=0)
         moved, self._centre = centre - self._centre, centre
         if self._last is not None:
-            evidence = self._evidence(hull, surface)
+            evidence = gather_evidence(hull, surface, self.POINTS, np.random.default_rng(self._seed))
             carried = FigureState(self._last.root + moved, self._last.rotations, self._last.shape)
             result = refine(carried, evidence, self._weights, 10 if np.abs(moved).max() < 0.1 else 20)
             if self._frame % self.PATIENCE == 0:
-                result = self._check_arms(result, hull, surface)
+                result = self._check_arms(result, hull, surface, evidence)
             fit = Fit(result.state, result.system)
         if fit is None or self._doubts(fit.system.cost):
             self._last_scratch = self._frame
@@ -81,20 +81,19 @@ class Tracker:
         self._last = fit.state
         return fit
 
-    def _evidence(self, hull: Hull, surface: Surface) -> Evidence:
-        return gather_evidence(hull, surface, self.POINTS, np.random.default_rng(self._seed))
-
     def _doubts(self, cost: float) -> bool:
         waited = self._frame - self._last_scratch >= self._wait
         return waited and (cost > self.DOUBT * self._usual_cost or cost > self.DOUBTFUL_COST)
 
-    def _check_arms(self, result: lm.LmResult[FigureState], hull: Hull, surface: Surface) -> lm.LmResult[FigureState]:
+    def _check_arms(
+        self, result: lm.LmResult[FigureState], hull: Hull, surface: Surface, evidence: Evidence
+    ) -> lm.LmResult[FigureState]:
         """An arm that has slipped into the trunk stays there, for its flesh is explained: look for it elsewhere."""
         scene = make_scene(hull, surface, self._seed, self._weights, self._effort)
         best = result
         for state in with_arms(result.state, scene, self.ARM_PAIRS):
             settled = refine(state, scene.quick, scene.lenient, 5).state
-            other = refine(settled, self._evidence(hull, surface), self._weights, 8)
+            other = refine(settled, evidence, self._weights, 8)
             if other.system.cost < 0.94 * best.system.cost:
                 best = other
         return best
