@@ -5,11 +5,11 @@ python examples/slow_down_near_hand.py --ros-args -p robot:="[1.0, 0.5, 0.4]"   
 """
 
 import numpy as np
-import rclpy
 from geometry_msgs.msg import PoseArray, Twist
 from rclpy.node import Node
 
 from limbloc_ros.core.pose import JOINT
+from limbloc_ros.ros.node_main import main
 
 HANDS = [JOINT[name] for name in ("wrist_L", "fingertip_L", "wrist_R", "fingertip_R")]
 STOP_M, FREE_M, PATIENCE_S = 0.4, 1.2, 0.5  # stops below, full speed beyond; older postures count for nothing
@@ -40,5 +40,4 @@ class SlowDown(Node):
 
 
 if __name__ == "__main__":
-    rclpy.init()
-    rclpy.spin(SlowDown())
+    main(SlowDown)  # rclpy.init, spin, and a clean end on Ctrl-C

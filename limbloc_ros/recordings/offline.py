@@ -8,6 +8,7 @@ from the one before, and one process does them in order.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import multiprocessing
 import os
@@ -228,7 +229,8 @@ def _fitted(source: Source, config: OfflineConfig, jobs: int, part: _Part, kept:
         waiting: deque[Future[FrameResult]] = deque()
         try:
             for job in work:
-                waiting.append(pool.submit(_work, job))
+                with _interrupts_kept_from_children():
+                    waiting.append(pool.submit(_work, job))
                 # enough in flight to keep all busy, few enough for a long recording to fit in memory
                 while len(waiting) > 2 * jobs + 2 or (waiting and waiting[0].done()):
                     yield waiting.popleft().result()
@@ -252,10 +254,22 @@ def _jobs(source: Source, kept: KeptFrames, part: _Part) -> Iterator[_Job]:
 _worker: _Fitter | None = None
 
 
+@contextlib.contextmanager
+def _interrupts_kept_from_children() -> Iterator[None]:
+    """Processes started within never see Ctrl-C, which reaches the whole group: the parent decides how to end.
+
+    Blocked in the parent, because a child inherits that from its first instruction on; ignoring it in the child would
+    leave the second in which it imports. One that comes meanwhile reaches the parent at the end of the block.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def _start_worker(rig: Rig, config: OfflineConfig) -> None:
     global _worker
-    # Ctrl-C reaches the whole process group; the parent decides how to end.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     cv2.setNumThreads(1)
     _worker = _Fitter(rig, config)
 
