@@ -86,12 +86,9 @@ def rasterise(
     """Draw the triangles that face the camera into `image` and `mask` (255), nearest first by `zbuffer`.
 
     uv [V, 2] px, depth [V] m, shade [V], garments [V, 4] (see person.GARMENTS), stripe [V] rest height m for the
-    shirt's pattern, palette [5, 3] bgr of skin, hair, shirt, trousers, shoes. `mask` is 0 and `zbuffer` (1 / depth) is
-    cleared here within the box.
+    shirt's pattern, palette [5, 3] bgr of skin, hair, shirt, trousers, shoes. `mask` and `zbuffer` (1 / depth) are 0
+    within the box, or what other meshes have left there.
     """
-    for y in range(y0, y1):
-        for x in range(x0, x1):
-            zbuffer[y, x] = 0.0
     for f in range(len(faces)):
         a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
         if depth[a] < near or depth[b] < near or depth[c] < near:

@@ -47,6 +47,10 @@ class _Piece:
     path: Array
     clearance: Array
 
+    def first(self, frames: int) -> _Piece:
+        """Its first frames only."""
+        return _Piece(self.name, self.rotations[:frames], self.path[:frames], self.clearance[:frames])
+
 
 class Motion:
     """The motion of one person through time.
@@ -145,15 +149,11 @@ class Motion:
             pieces.append(self._walk(place, heading, target))
             place, heading = pieces[-1].path[-1], float(quat.heading(pieces[-1].rotations[-1, 0]))
         pieces.append(self._turn(place, heading, home[1]))
-        # The last step back to the start of the loop is smaller than a foot: slide it in during the turn.
-        slide = _smooth(np.linspace(0, 1, len(pieces[-1].path)))[:, None]
-        pieces[-1].path[:] += slide * (home[0] - pieces[-1].path[-1])
+        self._take(join_pieces(pieces, home[0]), loop_start=len(pieces[0].path))
 
-        joined = [pieces[0]]
-        for piece in pieces[1:]:
-            joined.append(_eased(joined[-1], piece))
-        # The loop's first motion must also ease in from the loop's end, which stands as the entrance ended.
-        self._loop_start = len(pieces[0].path)
+    def _take(self, joined: Sequence[_Piece], loop_start: int) -> None:
+        """Make the track of these; the part from frame `loop_start` on repeats for ever."""
+        self._loop_start = loop_start
         self._rotations = np.concatenate([p.rotations for p in joined])
         self._path = np.concatenate([p.path for p in joined])
         self._clearance = np.concatenate([p.clearance for p in joined])
@@ -253,6 +253,19 @@ class Motion:
         lean = quat.multiply(quat.about(2, -quat.heading(rotations[:, 0])), rotations[:, 0])
         rotations[:, 0] = quat.multiply(quat.about(2, headings), lean)
         return _Piece(name, rotations, places, np.zeros(len(k)))
+
+
+def join_pieces(pieces: Sequence[_Piece], home: Array) -> list[_Piece]:
+    """Pieces one after the other, each eased into the next; the last, a turn, slides to `home` [2] m.
+
+    The last step back to the start of the loop is smaller than a foot.
+    """
+    slide = _smooth(np.linspace(0, 1, len(pieces[-1].path)))[:, None]
+    pieces[-1].path[:] += slide * (home - pieces[-1].path[-1])
+    joined = [pieces[0]]
+    for piece in pieces[1:]:
+        joined.append(_eased(joined[-1], piece))
+    return joined
 
 
 def motion_names() -> tuple[str, ...]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A room with cameras and a person in it: images as a camera driver would deliver them, and the truth beside them."""
+"""A room with cameras and people in it: images as a camera driver would deliver them, and the truth beside them."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from limbloc_ros.core.camera import Camera, Rig
 from limbloc_ros.core.errors import ConfigError, RigError
 from limbloc_ros.rig.geometry import looking_at
 from limbloc_ros.simulation import _render_kernels as kernels
+from limbloc_ros.simulation.company import Thing
 from limbloc_ros.simulation.motion import Motion
 from limbloc_ros.simulation.person import Person, PosedPerson, load_person
 from limbloc_ros.simulation.surroundings import HALF_M, HEIGHT_M, Backdrop, backdrop
@@ -89,9 +90,9 @@ class SimulatedFrame:
     Attributes:
         t: s since the start.
         images: camera name -> uint8 [height, width, 3] bgr.
-        masks: camera name -> uint8 [height, width], 255 where the person is: the true silhouette.
-        joints: [25, 3] the true joints (core.pose.JOINT_NAMES), m; None while the room is empty.
-        action: the name of the motion, `empty` while the room is empty.
+        masks: camera name -> uint8 [height, width], 255 where people and things are: the true silhouette.
+        joints: [25, 3] the first person's true joints (core.pose.JOINT_NAMES), m; None while the room is empty.
+        action: the name of the first person's motion, `empty` while the room is empty.
     """
 
     t: float
@@ -102,12 +103,23 @@ class SimulatedFrame:
 
 
 @dataclass(frozen=True)
+class _Lit:
+    """A body or a thing in one instant, as `rasterise` takes it."""
+
+    vertices: Array
+    faces: NDArray[np.int32]
+    shade: Array
+    garments: Array
+    stripe: Array
+    palette: Array
+
+
+@dataclass(frozen=True)
 class _Instant:
-    """What all cameras share at one time: the lit person, and the light that is left on the floor around it."""
+    """What all cameras share at one time: what stands there, lit, and the light that is left on the floor around it."""
 
     t: float
-    person: PosedPerson
-    shade: Array
+    lit: tuple[_Lit, ...]
     floor_light: NDArray[np.float32]  # [h, w] of cells
     floor_cell: tuple[int, int]  # x, y of its first cell
 
@@ -139,7 +151,7 @@ class _View:
 
 
 class SimulatedRoom:
-    """Cameras that film a person in a room; everything is a pure function of (arguments, t).
+    """Cameras that film people in a room; everything is a pure function of (arguments, t).
 
     Args:
         rig: the cameras, inside the room (walls at x, y = +-3 m, ceiling at 2.9 m); `default_rig()` makes some.
@@ -149,6 +161,8 @@ class SimulatedRoom:
         playlist: names of motions in order (`motion.motion_names()`), repeated for ever; None is a varied default.
         noise_sigma: standard deviation of the sensor noise, grey levels.
         light_drift: the light changes slowly by up to this fraction.
+        motions: of several people (`company.company`), the first first; then `person` and `playlist` mean nothing.
+        things: furniture.
 
     Raises:
         ConfigError: a value out of range. RigError: a camera outside the room.
@@ -163,6 +177,8 @@ class SimulatedRoom:
         playlist: Sequence[str] | None = None,
         noise_sigma: float = 2.5,
         light_drift: float = 0.03,
+        motions: Sequence[Motion] = (),
+        things: Sequence[Thing] = (),
     ) -> None:
         if not 0 <= noise_sigma <= 25:
             raise ConfigError(f"noise_sigma: expected 0 to 25 grey levels, got {noise_sigma}")
@@ -176,14 +192,20 @@ class SimulatedRoom:
                     f"|x|, |y| below {HALF_M} m and z between 0 and {HEIGHT_M} m"
                 )
         self.rig = rig
-        self.person = load_person(person) if isinstance(person, str) else person
-        self.motion = Motion(self.person, seed, empty_s, playlist)
+        if motions:
+            self.person, self.motion = motions[0].person, motions[0]
+        else:
+            self.person = load_person(person) if isinstance(person, str) else person
+            self.motion = Motion(self.person, seed, empty_s, playlist)
+        self.others = tuple(motions[1:])
+        self.things = tuple(things)
         self.seed = seed
         self._light_drift = light_drift
         rng = np.random.default_rng([seed, 11])
         self._noise = np.clip(np.rint(rng.normal(0, noise_sigma, 1 << 20)), -127, 127).astype(np.int8)
         self._tone = rng.uniform(0.93, 1.07, len(self.person.vertices))
-        self._palette = np.array(_PALETTES.get(self.person.name, _PALETTES["man"]), dtype=np.float64)
+        self._other_tones = tuple(rng.uniform(0.93, 1.07, len(other.person.vertices)) for other in self.others)
+        self._palette = _palette(self.person)
         self._stripe = np.ascontiguousarray(self.person.vertices[:, 2])
         self._views: dict[str, _View] = {}
         self._instant: _Instant | None = None
@@ -199,6 +221,11 @@ class SimulatedRoom:
         """The true joints [25, 3] at time t s, m, in the order of JOINT_NAMES; None while the room is empty."""
         posed = self.motion.pose(t)
         return None if posed is None else posed.joints.copy()
+
+    def everybodys_joints(self, t: float) -> list[Array | None]:
+        """The true joints of everybody at time t s, as `joints` gives those of the first."""
+        found = [motion.pose(t) for motion in (self.motion, *self.others)]
+        return [None if posed is None else posed.joints.copy() for posed in found]
 
     def render(self, camera_name: str, t: float) -> Image:
         """The image uint8 [height, width, 3] bgr of one camera at time t s; the same as in `frame`."""
@@ -218,7 +245,7 @@ class SimulatedRoom:
         if instant is not None:
             clean = view.empty.copy()
             self._draw_shadow(view, instant, clean)
-            self._draw_person(view, instant, clean, mask)
+            self._draw(view, instant, clean, mask)
         out = np.empty((height, width * 3), np.uint8)
         place = [self.seed, view.index, round(t * 1e6) & 0xFFFFFFFF]
         key = np.random.SeedSequence(place).generate_state(1, np.uint64)[0]
@@ -245,16 +272,33 @@ class SimulatedRoom:
     def _instant_at(self, t: float) -> _Instant | None:
         if self._instant is not None and self._instant.t == t:
             return self._instant
-        posed = self.motion.pose(t)
-        if posed is None:
+        lit = self._lit(t)
+        if not lit:
             return None
-        shade = np.empty(len(posed.vertices))
-        kernels.shade_vertices(posed.vertices, self.person.faces, _LIGHT, self._tone, shade)
-        light, cell = self._floor_light(posed.vertices)
-        self._instant = _Instant(t, posed, shade, light, cell)
+        light, cell = self._floor_light(*_joined(lit))
+        self._instant = _Instant(t, lit, light, cell)
         return self._instant
 
-    def _floor_light(self, vertices: Array) -> tuple[NDArray[np.float32], tuple[int, int]]:
+    def _lit(self, t: float) -> tuple[_Lit, ...]:
+        """Everybody and everything that is there."""
+        found: list[_Lit] = []
+        posed = self.motion.pose(t)
+        if posed is not None:
+            found.append(_light(posed, self.person, self._tone, self._stripe, self._palette))
+        for motion, tone in zip(self.others, self._other_tones, strict=True):
+            posed = motion.pose(t)
+            if posed is not None:
+                stripe = np.ascontiguousarray(motion.person.vertices[:, 2])
+                found.append(_light(posed, motion.person, tone, stripe, _palette(motion.person)))
+        for thing in self.things:
+            vertices = thing.at(t)
+            if vertices is not None:
+                found.append(_light_thing(vertices, thing))
+        return tuple(found)
+
+    def _floor_light(
+        self, vertices: Array, faces: NDArray[np.int32]
+    ) -> tuple[NDArray[np.float32], tuple[int, int]]:
         """The lamp's shadow (soft) and the dark below what touches the floor (softer), as remaining light by cell."""
         heights = np.maximum(vertices[:, 2], 0.0)
         below = (vertices[:, :2] + HALF_M) / _CELL_M
@@ -264,8 +308,8 @@ class SimulatedRoom:
         high = np.ceil(np.maximum(below.max(0), lamp.max(0))).astype(int) + margin
         shape = (high[1] - low[1], high[0] - low[0])
         shadow, contact = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
-        kernels.cover_floor(lamp, heights, self.person.faces, 1e9, low[0], low[1], shadow)
-        kernels.cover_floor(below, heights, self.person.faces, 0.5, low[0], low[1], contact)
+        kernels.cover_floor(lamp, heights, faces, 1e9, low[0], low[1], shadow)
+        kernels.cover_floor(below, heights, faces, 0.5, low[0], low[1], contact)
         shadow = cv2.blur(cv2.blur(shadow, (5, 5)), (5, 5))
         contact = cv2.blur(cv2.blur(contact, (9, 9)), (9, 9))
         light = (1 - np.float32(0.28) * shadow) * (1 - np.float32(0.4) * contact)
@@ -282,17 +326,50 @@ class SimulatedRoom:
         if box is not None:
             kernels.darken_floor(image, view.floor, instant.floor_light, x0, y0, *box)
 
-    def _draw_person(self, view: _View, instant: _Instant, image: Image, mask: Mask) -> None:
-        uv, depth = view.project(instant.person.vertices)
-        box = _image_box(uv, depth, _NEAR_M, view.camera)
-        if box is None:
+    def _draw(self, view: _View, instant: _Instant, image: Image, mask: Mask) -> None:
+        seen = []
+        for lit in instant.lit:
+            uv, depth = view.project(lit.vertices)
+            box = _image_box(uv, depth, _NEAR_M, view.camera)
+            if box is not None:
+                seen.append((lit, uv, depth, box))
+        if not seen:
             return
-        kernels.rasterise(
-            uv, depth, self.person.faces, instant.shade, self.person.garments, self._stripe, self._palette, _NEAR_M,
-            image, mask, view.zbuffer, *box,
-        )  # fmt: skip
-        x0, y0, x1, y1 = box
+        boxes = np.array([box for *_, box in seen])
+        (x0, y0), (x1, y1) = boxes[:, :2].min(axis=0), boxes[:, 2:].max(axis=0)
+        view.zbuffer[y0:y1, x0:x1] = 0.0
+        for lit, uv, depth, box in seen:
+            kernels.rasterise(
+                uv, depth, lit.faces, lit.shade, lit.garments, lit.stripe, lit.palette, _NEAR_M,
+                image, mask, view.zbuffer, *box,
+            )  # fmt: skip
         kernels.soften_edges(image, image[y0:y1, x0:x1].copy(), mask, x0, y0, x1, y1)
+
+
+def _palette(person: Person) -> Array:
+    return np.array(_PALETTES.get(person.name, _PALETTES["man"]), dtype=np.float64)
+
+
+def _light(posed: PosedPerson, person: Person, tone: Array, stripe: Array, palette: Array) -> _Lit:
+    shade = np.empty(len(posed.vertices))
+    kernels.shade_vertices(posed.vertices, person.faces, _LIGHT, tone, shade)
+    return _Lit(posed.vertices, person.faces, shade, person.garments, stripe, palette)
+
+
+def _light_thing(vertices: Array, thing: Thing) -> _Lit:
+    shade = np.empty(len(vertices))
+    kernels.shade_vertices(vertices, thing.faces, _LIGHT, np.ones(len(vertices)), shade)
+    bare = np.full((len(vertices), 4), -1.0)  # no garment anywhere: the palette's first colour
+    return _Lit(
+        vertices, thing.faces, shade, bare, np.zeros(len(vertices)), np.tile(np.array(thing.bgr, np.float64), (5, 1))
+    )
+
+
+def _joined(lit: Sequence[_Lit]) -> tuple[Array, NDArray[np.int32]]:
+    """All of them as one mesh: vertices and faces."""
+    before = np.cumsum([0, *(len(each.vertices) for each in lit)])
+    faces = [each.faces + np.int32(start) for each, start in zip(lit, before, strict=False)]
+    return np.concatenate([each.vertices for each in lit]), np.concatenate(faces)
 
 
 def _image_box(uv: Array, depth: Array, near: float, camera: Camera) -> tuple[int, int, int, int] | None:
