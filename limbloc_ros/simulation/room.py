@@ -296,9 +296,7 @@ class SimulatedRoom:
                 found.append(_light_thing(vertices, thing))
         return tuple(found)
 
-    def _floor_light(
-        self, vertices: Array, faces: NDArray[np.int32]
-    ) -> tuple[NDArray[np.float32], tuple[int, int]]:
+    def _floor_light(self, vertices: Array, faces: NDArray[np.int32]) -> tuple[NDArray[np.float32], tuple[int, int]]:
         """The lamp's shadow (soft) and the dark below what touches the floor (softer), as remaining light by cell."""
         heights = np.maximum(vertices[:, 2], 0.0)
         below = (vertices[:, :2] + HALF_M) / _CELL_M
