@@ -101,8 +101,9 @@ def company(people: int, together: str, seed: int = 0, empty_s: float = 1.5, per
     names = [person, *(name for name in PERSON_NAMES if name != person)][:people]
     rng = np.random.default_rng([seed, 23])
     courses = []
+    sides = _SIDES_DEG[MOST if together == "crossing" else people]  # lanes are at right angles
     for k, name in enumerate(names):
-        side = math.radians(_SIDES_DEG[people][k])
+        side = math.radians(sides[k])
         at = np.array([math.cos(side), math.sin(side)])
         home = (float(_HOME_M * at[0]), float(_HOME_M * at[1]))
         entrance: list[Step] = [("from", (float(_FAR_M * at[0]), float(_FAR_M * at[1]))), ("go", home)]
