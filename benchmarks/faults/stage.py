@@ -1,0 +1,180 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The simulated room as a stage: the person comes and goes on cue, furniture is moved in, the lights change."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from limbloc_ros.core.camera import Rig
+from limbloc_ros.core.pose import JOINT
+from limbloc_ros.simulation.motion import Motion
+from limbloc_ros.simulation.person import PosedPerson
+from limbloc_ros.simulation.room import SimulatedRoom
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+Posture = Callable[[PosedPerson], PosedPerson]
+
+#: Corners and outward triangles of the unit cube.
+_CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=np.float64)
+_SIDES = np.array(
+    [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4],
+     [1, 5, 7], [1, 7, 3]], dtype=np.int32,
+)  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
+class Prop:
+    """A thing of boxes: vertices [V, 3] m in world axes, triangles [F, 3], colour bgr as one of the person's clothes."""
+
+    vertices: Array
+    faces: NDArray[np.int32]
+    garment: int
+
+    def moved(self, offset: Array) -> Prop:
+        """The same thing elsewhere."""
+        return dataclasses.replace(self, vertices=self.vertices + offset)
+
+
+def boxes(*corners: tuple[tuple[float, float, float], tuple[float, float, float]], garment: int) -> Prop:
+    """A thing made of boxes, each given by its lower and upper corner, m; `garment` is a column of GARMENTS."""
+    vertices = [np.array(low) + _CORNERS * (np.array(high) - np.array(low)) for low, high in corners]
+    faces = [_SIDES + 8 * k for k in range(len(corners))]
+    return Prop(np.concatenate(vertices), np.concatenate(faces).astype(np.int32), garment)
+
+
+#: How fast the person moves, of life: at five images a second as far from image to image as in life at ten.
+PACE = 0.5
+
+#: A chair with a seat at 45 cm and a back of 95 cm, beside the middle of the room.
+CHAIR = boxes(
+    ((-0.22, -0.22, 0.40), (0.22, 0.22, 0.46)),
+    ((-0.22, 0.18, 0.46), (0.22, 0.22, 0.95)),
+    *(((x, y, 0.0), (x + 0.04, y + 0.04, 0.40)) for x in (-0.22, 0.18) for y in (-0.22, 0.18)),
+    garment=1,
+)
+#: A parcel of 40 x 30 x 30 cm.
+BOX = boxes(((-0.15, -0.20, -0.15), (0.15, 0.20, 0.15)), garment=2)
+
+
+def lying(posed: PosedPerson) -> PosedPerson:
+    """On the back on the floor."""
+    turn = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
+    middle = posed.joints.mean(axis=0)
+    vertices = (posed.vertices - middle) @ turn.T
+    floor = np.array([0.0, 0.0, -vertices[:, 2].min()])
+    joints = (posed.joints - middle) @ turn.T
+    return PosedPerson(vertices + floor, joints + floor, turn @ posed.bone_rotations, posed.bone_positions)
+
+
+def at(x: float, y: float) -> Posture:
+    """The same motion with the pelvis above (x, y), m."""
+
+    def move(posed: PosedPerson) -> PosedPerson:
+        here = posed.joints[JOINT["pelvis_centre"]]
+        return posed.moved([x - here[0], y - here[1], 0.0])
+
+    return move
+
+
+class _Shown:
+    """Stands in for the room's Motion: what is on the stage now, whatever the time."""
+
+    def __init__(self, mesh: PosedPerson | None) -> None:
+        self.mesh = mesh
+
+    def pose(self, _: float) -> PosedPerson | None:
+        return self.mesh
+
+
+class Stage(SimulatedRoom):
+    """A room whose play is directed while it runs.
+
+    Attributes:
+        time_s: where in the motion the person is; `pace` says how fast it goes on (0 stands still, -1 backwards).
+        posture: changes the person before he is drawn, or None.
+        chair: where a chair stands on the floor [2], m, or None. box: whether the person carries one.
+        light: what the cameras' images go through, or None.
+    """
+
+    def __init__(self, rig: Rig, motions: tuple[str, ...], seed: int = 0) -> None:
+        super().__init__(rig, "man", seed, empty_s=1.0, playlist=motions)
+        self.script: Motion = self.motion
+        self.body, self._body_tone = self.person, self._tone
+        self.time_s, self.pace = 0.0, 0.0
+        self.posture: Posture | None = None
+        self.chair: tuple[float, float] | None = None
+        self.box = False
+        self.light: Callable[[Image], Image] | None = None
+        times = np.arange(self.script.empty_s, self.script.empty_s + 20.0, 0.05)
+        #: Where in the motion the person has come in.
+        self.entered_s = float(next(t for t in times if self.script.action(t) != "walk"))
+
+    def enter(self) -> None:
+        """The person is in the room at once."""
+        self.time_s, self.pace = self.entered_s, PACE
+
+    def clear(self) -> None:
+        """Nobody and nothing is there."""
+        self.time_s, self.pace = 0.0, 0.0
+        self.posture, self.chair, self.box = None, None, False
+
+    def shoot(self, seconds: float, clock_s: float) -> tuple[dict[str, Image], Array | None]:
+        """Let `seconds` pass; all cameras' images and the true joints [25, 3], None while nobody is there.
+
+        `clock_s` is the time of day, which the noise and the drift of the light depend on.
+        """
+        self.time_s = max(self.time_s + self.pace * seconds, 0.0)
+        if self.pace < 0 and self.time_s < self.script.empty_s:
+            self.pace = 0.0  # he is out of the door
+        posed = self.script.pose(self.time_s)
+        if posed is not None and self.posture is not None:
+            posed = self.posture(posed)
+        self._show(posed)
+        images = {name: self.render(name, clock_s) for name in self.rig.names}
+        if self.light is not None:
+            images = {name: self.light(image) for name, image in images.items()}
+        return images, None if posed is None else posed.joints.copy()
+
+    def _show(self, posed: PosedPerson | None) -> None:
+        """Put person and things on the stage as one mesh, which is what the renderer draws."""
+        things: list[Prop] = []
+        if self.chair is not None:
+            things.append(CHAIR.moved(np.array([*self.chair, 0.0])))
+        if self.box and posed is not None:
+            things.append(BOX.moved(posed.joints[JOINT["torso_centre"]] + 0.28 * _forward(posed)))
+        self._instant = None
+        if posed is None and not things:
+            self.motion = _Shown(None)  # type: ignore[assignment]
+            return
+        vertices, faces, garments, tones = [], [], [], []
+        if posed is not None:
+            vertices, faces, garments, tones = [posed.vertices], [self.body.faces], [self.body.garments], [self._body_tone]
+        for thing in things:
+            faces.append(thing.faces + sum(map(len, vertices)))
+            vertices.append(thing.vertices)
+            worn = np.full((len(thing.vertices), 4), -1.0)
+            worn[:, thing.garment] = 1.0
+            garments.append(worn)
+            tones.append(np.ones(len(thing.vertices)))
+        mesh = np.concatenate(vertices)
+        self.person = dataclasses.replace(
+            self.body, vertices=mesh, faces=np.concatenate(faces), garments=np.concatenate(garments)
+        )
+        self._tone = np.concatenate(tones)
+        self._stripe = np.full(len(mesh), 0.5)
+        if posed is not None:
+            self._stripe[: len(posed.vertices)] = self.body.vertices[:, 2]
+        nothing = np.zeros((0, 3))
+        self.motion = _Shown(PosedPerson(mesh, nothing, np.zeros((0, 3, 3)), nothing))  # type: ignore[assignment]
+
+
+def _forward(posed: PosedPerson) -> Array:
+    """Where the chest looks, in the floor's plane."""
+    left = posed.joints[JOINT["shoulder_L"]] - posed.joints[JOINT["shoulder_R"]]
+    forward = np.array([left[1], -left[0], 0.0])
+    return forward / np.linalg.norm(forward)
