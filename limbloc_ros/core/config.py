@@ -132,6 +132,15 @@ class HullConfig:
         live=True,
     )
     min_voxels: int = setting(500, "smaller hulls are no person", unit="voxels", low=1, high=10_000_000, live=True)
+    min_further_voxels: int = setting(
+        1500,
+        "of several separate parts of the hull the largest is kept, and those that are no smaller than this (as if "
+        "voxels were 0.02 m) and no phantoms: they may be further people",
+        unit="voxels",
+        low=1,
+        high=10_000_000,
+        live=True,
+    )
 
 
 @dataclass(frozen=True)
@@ -155,6 +164,9 @@ class FitConfig:
     engine: str = setting("robust", "which fitting chain runs", choices=("robust", "paper"))
     temporal: bool = setting(False, "start from the previous frame; falls back by itself", live=True)
     seed: int = setting(0, "seed of every random choice: the same input gives the same result", low=0, high=2**31 - 1)
+    max_people: int = setting(
+        4, "most people who are followed at once, each with an id of its own; 1: only the largest body", low=1, high=16
+    )
 
 
 @dataclass(frozen=True)
@@ -201,12 +213,12 @@ def from_mapping(kind: type[T], values: Mapping[str, Any]) -> T:
             default = field.default_factory()
         if dataclasses.is_dataclass(default):
             if not isinstance(value, Mapping):
-                raise ConfigError(f"{name}: expected a section of parameters, got {value!r}")
+                raise ConfigError(f"{name}: expected a section of parameters, got {value!r:.80}")
             kwargs[name] = from_mapping(type(default), value)
             continue
         if isinstance(default, float) and isinstance(value, int) and not isinstance(value, bool):
-            value = float(value)
+            value = float(value) if abs(value) < 2**1000 else math.inf
         if type(value) is not type(default):
-            raise ConfigError(f"{name}: expected {type(default).__name__} like {default!r}, got {value!r}")
+            raise ConfigError(f"{name}: expected {type(default).__name__} like {default!r}, got {value!r:.80}")
         kwargs[name] = value
     return validated(kind(**kwargs))

@@ -36,6 +36,8 @@ ROOT, LEAF = 32, 4
 INNER_PX = 1.5
 #: Fraction of unexplained foreground from which on the cameras contradict each other as much as we distinguish.
 DOUBTED_FRACTION = 0.02
+#: A part of the hull is a phantom when in all cameras but one less of what it covers is covered by it alone.
+PHANTOM_SHARE = 0.1
 #: In `Hull.cut_by`: no camera decided here.
 NOBODY = 255
 
@@ -309,7 +311,9 @@ def carve_silhouettes(silhouettes: Silhouettes, rig: Rig, config: HullConfig) ->
         who[near].astype(np.uint8),
         np.stack([rig.camera(name).T_world_camera[:3, 3] for name in silhouettes.names]).astype(np.float32),
     )
-    hull = largest_component(hull)
+    labels, sizes = _label(hull)
+    if len(sizes) > 2:
+        hull = _with_labels(hull, labels, _people_among(hull, labels, sizes, silhouettes, config))
     if hull.inside_count * (config.voxel_m / 0.02) ** 3 < config.min_voxels:
         return NoPerson(f"the hull has only {hull.inside_count} voxels of {config.voxel_m} m: too small for a person")
     return hull
@@ -317,10 +321,69 @@ def carve_silhouettes(silhouettes: Silhouettes, rig: Rig, config: HullConfig) ->
 
 def largest_component(hull: Hull) -> Hull:
     """The hull with only its largest connected part and the shell around it; bridges gaps of about two voxels."""
-    labels, sizes = kernels.label_components(hull.sdf < np.float32(hull.voxel_m))
+    labels, sizes = _label(hull)
+    return hull if len(sizes) <= 2 else _with_labels(hull, labels, [int(sizes[1:].argmax()) + 1])
+
+
+def components(hull: Hull) -> list[Hull]:
+    """Every connected part of the hull as a hull of its own, the largest first; the hull itself if it is in one."""
+    labels, sizes = _label(hull)
     if len(sizes) <= 2:
-        return hull
-    part = labels == int(sizes[1:].argmax()) + 1
+        return [hull]
+    order = np.argsort(-sizes[1:], kind="stable") + 1
+    return [_with_labels(hull, labels, [int(label)]) for label in order]
+
+
+def _label(hull: Hull) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+    """Which connected part each voxel belongs to (0: none), and how large they are (from 1 on)."""
+    return kernels.label_components(hull.sdf < np.float32(hull.voxel_m))  # type: ignore[no-any-return]
+
+
+def _people_among(
+    hull: Hull, labels: NDArray[np.int32], sizes: NDArray[np.int64], silhouettes: Silhouettes, config: HullConfig
+) -> list[int]:
+    """The parts of the hull that may be people: the largest, and others that are large enough and no phantoms.
+
+    Where the silhouettes of several people cross there may be volume that nobody fills (a phantom). All of it hides
+    before or behind somebody in every camera: it covers hardly a pixel that another part does not cover as well. Of
+    the parts of which that is true the one with the least to itself goes, and the others are asked again.
+    """
+    inside = np.bincount(labels[hull.sdf < 0], minlength=len(sizes))
+    large = inside * (config.voxel_m / 0.02) ** 3 >= config.min_further_voxels
+    large[0], large[int(sizes[1:].argmax()) + 1] = False, True
+    parts = [int(label) for label in np.flatnonzero(large)]
+    covers = [_cover(hull, labels == label, silhouettes) for label in parts] if len(parts) > 1 else []
+    while len(parts) > 1:
+        total: NDArray[np.uint8] = np.stack(covers).sum(axis=0, dtype=np.uint8)
+        alone = [_share_alone(cover, total, silhouettes) for cover in covers]
+        least = min(range(len(parts)), key=lambda n: (alone[n], int(sizes[parts[n]])))
+        if alone[least] >= PHANTOM_SHARE:
+            break
+        del parts[least], covers[least]
+    return parts
+
+
+def _cover(hull: Hull, part: NDArray[np.bool_], silhouettes: Silhouettes) -> NDArray[np.uint8]:
+    """Which pixels of all silhouettes a part of the hull covers; uint8 in the layout of `silhouettes.field`."""
+    at = np.stack(np.nonzero(part & (hull.sdf < 0))) + np.asarray(hull.index_min)[:, None]
+    covered = np.zeros(silhouettes.field.size, np.uint8)
+    centres = np.ascontiguousarray((at + 0.5) * hull.voxel_m)
+    mending.cover(centres, 0.875 * hull.voxel_m, silhouettes.cameras, silhouettes.boxes, covered)
+    return covered & (silhouettes.field < -INNER_PX)
+
+
+def _share_alone(cover: NDArray[np.uint8], total: NDArray[np.uint8], silhouettes: Silhouettes) -> float:
+    """How much of what a part covers it alone covers, in the camera where that is second most."""
+    shares = np.zeros(len(silhouettes.names))
+    for c, (_, _, width, height, offset) in enumerate(silhouettes.boxes):
+        mine = cover[offset : offset + width * height] > 0
+        shares[c] = (total[offset : offset + width * height][mine] == 1).sum() / max(int(mine.sum()), 1)
+    return float(np.sort(shares)[-min(2, len(shares))])
+
+
+def _with_labels(hull: Hull, labels: NDArray[np.int32], keep: list[int]) -> Hull:
+    """The hull with only some of its connected parts and the shell around them."""
+    part = labels == keep[0] if len(keep) == 1 else np.isin(labels, keep)
     reach = math.ceil(hull.band_m / hull.voxel_m)
     near = part.copy()
     for axis in range(3):
@@ -331,9 +394,9 @@ def largest_component(hull: Hull) -> Hull:
             grown[tuple(ahead)] |= near[tuple(behind)]
             grown[tuple(behind)] |= near[tuple(ahead)]
         near = grown
-    keep = near & ((labels == 0) | part)
-    sdf = np.where(keep, hull.sdf, np.float32(hull.band_m))
-    cut_by = None if hull.cut_by is None else np.where(keep, hull.cut_by, np.uint8(NOBODY))
+    kept = near & ((labels == 0) | part)
+    sdf = np.where(kept, hull.sdf, np.float32(hull.band_m))
+    cut_by = None if hull.cut_by is None else np.where(kept, hull.cut_by, np.uint8(NOBODY))
     return _cropped(replace(hull, sdf=sdf, cut_by=cut_by))
 
 
@@ -360,7 +423,8 @@ def carve(masks: Mapping[str, NDArray[np.uint8]], rig: Rig, config: HullConfig) 
         config: voxel size, voting, limits.
 
     Returns:
-        the hull, cropped to its largest component plus the shell, or why there is none.
+        the hull, cropped to those connected parts that may be people (`components` takes them apart) plus the shell, or
+        why there is none.
 
     Raises:
         InputError: a mask has not its camera's size.
