@@ -16,7 +16,7 @@ import numpy as np
 
 from .cameras import Shot, Tamper
 from .live import Live
-from .stage import PACE, Image, at, lying
+from .stage import Image, at, lying
 
 Act = Callable[[Live], None]
 
@@ -206,20 +206,9 @@ def chair_alone(live: Live) -> None:
 
 
 def no_chair(live: Live) -> None:
-    """The chair is taken away; who was away comes back."""
+    """The chair is taken away; the person is there."""
     live.stage.chair = None
-    if live.stage.pace == 0:
-        live.stage.enter()
-
-
-def leave(live: Live) -> None:
-    """The person walks out of the door."""
-    live.stage.time_s, live.stage.pace = live.stage.entered_s, -PACE
-
-
-def come_in(live: Live) -> None:
-    """And comes in again."""
-    live.stage.time_s, live.stage.pace = live.stage.script.empty_s, PACE
+    live.stage.enter()
 
 
 def pose_as(posture: Callable[..., object] | None, box: bool = False) -> Act:
@@ -313,7 +302,7 @@ SCENARIOS = (
     Scenario("lights_off", "the light switched off, and on again", light(dusk), mend, 12.0, 60.0),
     Scenario("chair", "a chair moved in beside the person", chair, no_chair, 12.0),
     Scenario("chair_alone", "the person goes, a chair stays", chair_alone, no_chair, 12.0),
-    Scenario("leaves", "the person leaves, the room is empty, he returns", leave, come_in, 20.0),
+    Scenario("leaves", "the person leaves, the room is empty, he returns", lambda live: live.stage.leave(), lambda live: live.stage.come_in(), 20.0),
     Scenario("half_out", "half out of the carve volume", pose_as(at(1.45, 0.2)), pose_as(None), 8.0),
     Scenario("lies", "lies on the floor, gets up", pose_as(lying), pose_as(None), 8.0),
     Scenario("box", "carries a box, puts it away", pose_as(None, True), pose_as(None), 8.0),

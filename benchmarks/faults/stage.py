@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -49,6 +50,9 @@ def boxes(*corners: tuple[tuple[float, float, float], tuple[float, float, float]
 
 #: How fast the person moves, of life: at five images a second as far from image to image as in life at ten.
 PACE = 0.5
+#: In the room he paces slowly from side to side, m and s, standing relaxed: a posture that is followed without errors,
+#: so that those that are seen come from the faults.
+SWAY_M, SWAY_S = 0.35, 12.0
 
 #: A chair with a seat at 45 cm and a back of 95 cm, beside the middle of the room.
 CHAIR = boxes(
@@ -95,7 +99,8 @@ class Stage(SimulatedRoom):
     """A room whose play is directed while it runs.
 
     Attributes:
-        time_s: where in the motion the person is; `pace` says how fast it goes on (0 stands still, -1 backwards).
+        time_s: where on the way in from the door the person is; `pace` says how fast he goes on (negative: backwards,
+            and out). Once inside he stays in that posture and sways.
         posture: changes the person before he is drawn, or None.
         chair: where a chair stands on the floor [2], m, or None. box: whether the person carries one.
         light: what the cameras' images go through, or None.
@@ -105,7 +110,7 @@ class Stage(SimulatedRoom):
         super().__init__(rig, "man", seed, empty_s=1.0, playlist=motions)
         self.script: Motion = self.motion
         self.body, self._body_tone = self.person, self._tone
-        self.time_s, self.pace = 0.0, 0.0
+        self.time_s, self.pace, self._inside_s = 0.0, 0.0, 0.0
         self.posture: Posture | None = None
         self.chair: tuple[float, float] | None = None
         self.box = False
@@ -116,7 +121,15 @@ class Stage(SimulatedRoom):
 
     def enter(self) -> None:
         """The person is in the room at once."""
-        self.time_s, self.pace = self.entered_s, PACE
+        self.time_s, self.pace = self.entered_s, 0.0
+
+    def leave(self) -> None:
+        """The person walks out of the door, backwards."""
+        self.pace = -PACE
+
+    def come_in(self) -> None:
+        """And comes in again."""
+        self.time_s, self.pace = self.script.empty_s, PACE
 
     def clear(self) -> None:
         """Nobody and nothing is there."""
@@ -128,10 +141,13 @@ class Stage(SimulatedRoom):
 
         `clock_s` is the time of day, which the noise and the drift of the light depend on.
         """
-        self.time_s = max(self.time_s + self.pace * seconds, 0.0)
-        if self.pace < 0 and self.time_s < self.script.empty_s:
-            self.pace = 0.0  # he is out of the door
+        self.time_s = min(max(self.time_s + self.pace * seconds, 0.0), self.entered_s)
         posed = self.script.pose(self.time_s)
+        if posed is not None and self.time_s == self.entered_s:
+            self._inside_s += seconds
+            posed = posed.moved([0.0, SWAY_M * math.sin(2 * math.pi * self._inside_s / SWAY_S), 0.0])
+        else:
+            self._inside_s = 0.0
         if posed is not None and self.posture is not None:
             posed = self.posture(posed)
         self._show(posed)
