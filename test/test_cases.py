@@ -118,7 +118,7 @@ def test_damaged_files(tmp_path):
         load_case(folder)
     (folder / "masks.npz").write_bytes(data)
     (folder / "meta.json").write_text("{")
-    with pytest.raises(InputError, match=r"meta\.json: not valid JSON"):
+    with pytest.raises(InputError, match=r"meta\.json, line 1: not valid JSON"):
         load_case(folder)
     (folder / "meta.json").write_text('{"fps": 0}')
     with pytest.raises(InputError, match=r"key fps: expected a positive number, got 0"):

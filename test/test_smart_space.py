@@ -163,7 +163,7 @@ def test_plan_for_a_bag_of_masks_needs_no_segmentation(tmp_path):
         ("network: {discovery: internet}", ConfigError, r"discovery: expected one of localhost, subnet, environment"),
         ("cameras: cam0", ConfigError, r"cameras: expected a list of names, got 'cam0'"),
         ("[1, 2]", ConfigError, r"expected keys such as source and rig, got list"),
-        ("a: [", ConfigError, r"room.yaml is not valid YAML"),
+        ("a: [", ConfigError, r"room.yaml, line \d: not valid YAML"),
         ("source: cameras", ConfigError, r"rig: expected a rig file for source cameras"),
         ("source: bag", ConfigError, r"bag: expected a rosbag2 folder or file for source bag, got none"),
         ("{source: bag, bag: b}", ConfigError, r"rig: expected the rig file of the recorded cameras"),

@@ -13,6 +13,12 @@ from limbloc_ros.core.errors import RigError
 
 Array = NDArray[np.float64]
 
+#: Larger pictures are taken for a damaged file or message.
+MAX_PIXELS = 64_000_000
+
+#: No room needs more; squares and products of larger numbers overflow further on.
+_LARGEST = {"K": 1e7, "T_world_camera": 1e4, "distortion": 1e7}
+
 DISTORTION_COEFFICIENTS = {"none": (0,), "radtan": (4, 5), "rational": (8, 12, 14), "fisheye": (4,)}
 
 
@@ -47,10 +53,22 @@ class Camera:
                 raise RigError(f"camera {self.name}: {name} must have shape {shape}, got {value.shape}")
             if not np.isfinite(value).all():
                 raise RigError(f"camera {self.name}: {name} holds a number that is not finite")
+            if value.size and np.abs(value).max() > _LARGEST[name]:
+                raise RigError(
+                    f"camera {self.name}: {name} holds {np.abs(value).max():g}; expected numbers up to "
+                    f"{_LARGEST[name]:g} (are the units metres and pixels?)"
+                )
             value.setflags(write=False)
             object.__setattr__(self, name, value)
+        # It becomes part of topics and file names.
+        if not self.name.isprintable() or any(part in ("", ".", "..") for part in self.name.split("/")):
+            raise RigError(f"expected a camera's name such as cam0, got {self.name!r:.80}")
         if self.width < 1 or self.height < 1:
             raise RigError(f"camera {self.name}: image size must be positive, got {self.width}x{self.height}")
+        if self.width * self.height > MAX_PIXELS:
+            raise RigError(
+                f"camera {self.name}: expected images of at most {MAX_PIXELS} pixels, got {self.width}x{self.height}"
+            )
         if self.K[0, 0] <= 0 or self.K[1, 1] <= 0:
             raise RigError(
                 f"camera {self.name}: K has focal lengths {self.K[0, 0]:g}, {self.K[1, 1]:g} px; expected positive "

@@ -15,12 +15,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from limbloc_ros.core.camera import MAX_PIXELS
 from limbloc_ros.core.errors import InputError
 
 Pixels = NDArray[np.uint8]
-
-#: Larger pictures are taken for a damaged message.
-MAX_PIXELS = 64_000_000
 
 
 class RawImage(Protocol):

@@ -25,12 +25,12 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, NoReturn
 
-import yaml
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.utilities import remove_ros_args
 
 from limbloc_ros.core.errors import ConfigError, LimblocError
+from limbloc_ros.rig.plain_values import yaml_values
 from limbloc_ros.ros import node_main
 
 #: Node classes by kind; their modules are imported when asked for, because each brings its own libraries.
@@ -114,8 +114,8 @@ def parse(text: str) -> Mapping[str, Any]:
     try:
         if "\n" not in text and "{" not in text:
             text = Path(text).read_text(encoding="utf-8")
-        description = yaml.safe_load(text)
-    except (OSError, yaml.YAMLError) as error:
+        description = yaml_values(text)
+    except (OSError, ValueError) as error:
         raise ConfigError(f"expected a description of nodes or a file with one: {error}") from error
     if not isinstance(description, Mapping) or not isinstance(description.get("nodes"), list):
         raise ConfigError("expected a description with a list of nodes, such as {nodes: [{kind: pose}]}")

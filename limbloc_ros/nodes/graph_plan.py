@@ -13,12 +13,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from limbloc_ros.core.config import from_mapping, setting
 from limbloc_ros.core.errors import ConfigError
 from limbloc_ros.recordings.bag_frames import CameraStream, camera_streams
 from limbloc_ros.recordings.bags import BagReader
+from limbloc_ros.rig.plain_values import yaml_values
 from limbloc_ros.rig.rig_file import load_rig, save_rig
 from limbloc_ros.ros.environment import NetworkConfig
 from limbloc_ros.ros.supervisor import ProcessConfig, ProcessPlan
@@ -72,18 +71,21 @@ def load_config(path: str | Path, overrides: Mapping[str, Any] | None = None) ->
     """
     path = Path(path)
     try:
-        values = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except OSError as error:
+        values = yaml_values(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: expected a smart space file such as config/smart_space.yaml: {error}") from error
-    except yaml.YAMLError as error:
-        raise ConfigError(f"{path} is not valid YAML: {error}") from error
+    except ValueError as error:
+        raise ConfigError(f"{path}{error}") from None
     values = {} if values is None else values
     if not isinstance(values, Mapping):
         raise ConfigError(f"{path}: expected keys such as source and rig, got {type(values).__name__}")
     values = dict(values)
     for key in ("rig", "bag", "record_to"):
         if isinstance(values.get(key), str) and values[key]:
-            values[key] = str(path.parent / Path(values[key]).expanduser())
+            try:
+                values[key] = str(path.parent / Path(values[key]).expanduser())
+            except RuntimeError as error:  # ~name of nobody
+                raise ConfigError(f"{path}: {key}: {values[key]!r:.80} is no path: {error}") from None
     for key, value in (overrides or {}).items():
         values[key] = _merged(values.get(key), value)
     try:

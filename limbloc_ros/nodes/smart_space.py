@@ -10,11 +10,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import yaml
 from rclpy.utilities import remove_ros_args
 
 from limbloc_ros.core.errors import ConfigError, LimblocError
 from limbloc_ros.nodes.graph_plan import SmartSpaceConfig, load_config, plan_graph
+from limbloc_ros.rig.plain_values import yaml_values
 from limbloc_ros.ros.environment import config_file, graph_environment
 from limbloc_ros.ros.supervisor import Supervisor
 
@@ -68,7 +68,10 @@ def config_from_arguments(options: argparse.Namespace) -> SmartSpaceConfig:
             section = section.setdefault(name, {})
             if not isinstance(section, dict):
                 raise ConfigError(f"--set: {key} lies inside of a value that was set before")
-        section[names[-1]] = yaml.safe_load(value)
+        try:
+            section[names[-1]] = yaml_values(value)
+        except ValueError as error:
+            raise ConfigError(f"--set {text}{error}") from None
     for key, value in (("source", options.source), ("rig", options.rig), ("bag", options.bag)):
         if value is not None:
             overrides[key] = value

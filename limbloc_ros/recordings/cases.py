@@ -8,8 +8,7 @@ begin with so many frames of the empty room, which the truth does not have: they
 
 from __future__ import annotations
 
-import json
-import zipfile
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,8 @@ from numpy.typing import NDArray
 
 from limbloc_ros.core.camera import Rig
 from limbloc_ros.core.errors import InputError
+from limbloc_ros.recordings.npz_file import read_npz
+from limbloc_ros.rig.plain_values import json_values
 from limbloc_ros.rig.rig_file import load_rig
 
 Array = NDArray[np.float64]
@@ -119,22 +120,15 @@ def load_case(folder: str | Path, rig: Rig | None = None) -> Case:
     )
 
 
-def read_npz(path: Path) -> dict[str, NDArray[Any]]:
-    """All arrays of an .npz archive; raises InputError when it is missing or damaged."""
-    try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive.files}
-    except (OSError, ValueError, zipfile.BadZipFile, EOFError, KeyError) as error:
-        raise InputError(f"{path} cannot be read as an .npz archive ({error}); copy it again") from None
-
-
 def _read_meta(path: Path) -> dict[str, Any]:
     if not path.is_file():
         return {}
     try:
-        meta = json.loads(path.read_text(encoding="utf-8"))
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        meta = json_values(path.read_text(encoding="utf-8"))
+    except UnicodeDecodeError as error:
         raise InputError(f"{path}: not valid JSON: {error}") from None
+    except ValueError as error:
+        raise InputError(f"{path}{error}") from None
     if not isinstance(meta, dict):
         raise InputError(f"{path}: expected an object with keys such as kind and fps, got {type(meta).__name__}")
     if not isinstance(meta.get("fps", DEFAULT_FPS), (int, float)) or meta.get("fps", DEFAULT_FPS) <= 0:
@@ -148,9 +142,22 @@ def _read_truth(path: Path, frames: int) -> dict[str, Array]:
     if not path.is_file():
         return {}
     archive = read_npz(path)
-    if not {"joints", "joint_names"} <= set(archive):
-        raise InputError(f"{path}: expected joints and joint_names, got {', '.join(archive)}")
-    joints, names = archive["joints"].astype(np.float64), archive["joint_names"]
-    if joints.shape != (frames, len(names), 3):
+    joints, names = joints_of(archive, path)
+    if len(joints) != frames:
         raise InputError(f"{path}: expected joints [{frames}, {len(names)}, 3], got {list(joints.shape)}")
-    return {str(name): joints[:, i] for i, name in enumerate(names)}
+    return {name: joints[:, i] for i, name in enumerate(names)}
+
+
+def joints_of(archive: Mapping[str, NDArray[Any]], path: Path) -> tuple[Array, tuple[str, ...]]:
+    """Joints [F, J, 3] m and their names out of an archive; raises InputError when they are not there or do not fit."""
+    if not {"joints", "joint_names"} <= set(archive):
+        raise InputError(f"{path}: expected joints and joint_names, got {', '.join(archive) or 'nothing'}")
+    joints, names = archive["joints"], archive["joint_names"]
+    if names.dtype.kind != "U" or names.ndim != 1 or joints.dtype.kind not in "fiu":
+        raise InputError(
+            f"{path}: expected joints as numbers and joint_names as a list of texts, got {joints.dtype} "
+            f"{list(joints.shape)} and {names.dtype} {list(names.shape)}"
+        )
+    if joints.ndim != 3 or joints.shape[1:] != (len(names), 3):
+        raise InputError(f"{path}: expected joints [F, {len(names)}, 3], got {list(joints.shape)}")
+    return joints.astype(np.float64), tuple(str(name) for name in names)

@@ -7,11 +7,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from limbloc_ros.core.config import BackgroundConfig, FitConfig, HullConfig, SyncConfig, from_mapping
 from limbloc_ros.core.errors import ConfigError
 from limbloc_ros.recordings.offline import OfflineConfig
+from limbloc_ros.rig.plain_values import yaml_values
 
 #: Where the method's parameters stand in the file; all else in it is about nodes and processes.
 SECTIONS: dict[str, tuple[str, type[Any]]] = {
@@ -54,12 +53,11 @@ def load_config(path: Path | None) -> OfflineConfig:
     if path is None:
         return OfflineConfig()
     try:
-        values = yaml.safe_load(path.read_text(encoding="utf-8"))
+        values = yaml_values(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"parameters file {path} cannot be read: {error}") from None
-    except yaml.MarkedYAMLError as error:
-        line = f", line {error.problem_mark.line + 1}" if error.problem_mark else ""
-        raise ConfigError(f"parameters file {path}{line}: not valid YAML: {error.problem}") from None
+    except ValueError as error:
+        raise ConfigError(f"parameters file {path}{error}") from None
     try:
         return config_from_mapping({} if values is None else values)
     except ConfigError as error:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -11,7 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from limbloc_ros.core.errors import InputError
-from limbloc_ros.recordings.cases import pack_mask, read_npz, unpack_mask
+from limbloc_ros.core.images import compressed_to_pixels
+from limbloc_ros.recordings.cases import pack_mask, unpack_mask
+from limbloc_ros.recordings.npz_file import read_npz
 from limbloc_ros.recordings.results import replace_file
 
 Pixels = NDArray[np.uint8]
@@ -85,14 +88,23 @@ class KeptFrames:
         arrays = read_npz(folder / FILE)
         if "numbers" not in arrays:
             raise InputError(f"{folder / FILE} is not a file of kept frames; run `process` again")
-        for number in arrays.pop("numbers"):
+        numbers = arrays.pop("numbers")
+        if numbers.dtype.kind != "i" or numbers.ndim != 1:
+            raise InputError(f"{folder / FILE} is damaged (numbers of {numbers.dtype}); run `process` again")
+        for number in numbers:
             kept._masks[int(number)], kept._images[int(number)] = {}, {}
-        for key, array in arrays.items():
-            kind, number, width, name = key.split(" ", 3)
-            if kind == "mask":
-                kept._masks[int(number)][name] = (array, int(width))
-            else:
-                kept._images[int(number)][name] = array
+        try:
+            for key, array in arrays.items():
+                kind, number, width, name = key.split(" ", 3)
+                if kind == "mask" and array.dtype == np.uint8 and array.shape[1] == -(-int(width) // 8):
+                    kept._masks[int(number)][name] = (array, int(width))
+                elif kind == "image" and array.dtype == np.uint8:
+                    compressed_to_pixels(SimpleNamespace(format="jpeg", data=array))
+                    kept._images[int(number)][name] = array
+                else:
+                    raise ValueError(key)
+        except (KeyError, IndexError, ValueError, InputError) as error:
+            raise InputError(f"{folder / FILE} is damaged ({error}); run `process` again") from None
         return kept
 
 

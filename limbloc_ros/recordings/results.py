@@ -29,7 +29,8 @@ from numpy.typing import NDArray
 
 from limbloc_ros.core.errors import InputError, NoPerson, OutputError
 from limbloc_ros.core.pose import JOINT_NAMES, Flesh, Pose
-from limbloc_ros.recordings.cases import read_npz
+from limbloc_ros.recordings.npz_file import read_npz
+from limbloc_ros.rig.plain_values import json_values
 
 Array = NDArray[np.float64]
 
@@ -172,8 +173,7 @@ class Run:
             raise InputError(
                 f"{folder} holds no finished run: expected run.npz in it; make one with `process INPUT --out {folder}`"
             )
-        about = json.loads((folder / "run.json").read_text()) if (folder / "run.json").is_file() else {}
-        return Run(load_frames(folder / "run.npz"), about)
+        return Run(load_frames(folder / "run.npz"), _read_about(folder / "run.json"))
 
 
 def save_frames(frames: Sequence[FrameResult], path: Path) -> None:
@@ -219,9 +219,57 @@ def load_frames(path: Path) -> tuple[FrameResult, ...]:
     """Read what `save_frames` wrote; raises InputError when the file is damaged."""
     data = read_npz(path)
     try:
+        _check_layout(data)
         return tuple(_frames(data))
-    except (KeyError, IndexError) as error:
+    except (KeyError, ValueError) as error:  # ValueError also: characters that no text has
         raise InputError(f"{path} is not a results file of this version ({error}); run `process` again") from None
+
+
+#: Arrays of `run.npz`: kind of dtype, and lengths by letter: F frames, P poses, the others as the figure has them.
+_LAYOUT = {
+    "stamps_ns": ("i", "F"), "found": ("b", "F"), "reasons": ("U", "F"), "stage_names": ("U", "T"),
+    "stage_ms": ("f", "FT"),
+}  # fmt: skip
+_POSE_LAYOUT = {
+    "bone_names": ("U", "B"), "angle_names": ("U", "A"), "size_names": ("U", "S"), "pose_stage_names": ("U", "U"),
+    "flesh_parts": ("i", "G3"), "flesh_part_names": ("U", "G"), "joints": ("f", "PJ3"), "rotations": ("f", "PB33"),
+    "angles": ("f", "PA"), "sizes": ("f", "PS"), "flesh_centres": ("f", "PC3"), "flesh_radii": ("f", "PC"),
+    "parameters": ("f", "PV"), "energy": ("f", "P"), "sigma": ("f", "PJ"), "reliable": ("b", "P"),
+    "pose_stage_ms": ("f", "PU"),
+}  # fmt: skip
+
+
+def _check_layout(data: dict[str, NDArray[Any]]) -> None:
+    """Raise KeyError or ValueError unless the arrays are what `save_frames` writes."""
+    lengths: dict[str, int] = {"3": 3, "J": len(JOINT_NAMES)}
+    if "found" in data and data["found"].dtype.kind == "b":
+        lengths["P"] = int(data["found"].sum())
+    for name, (kind, letters) in {**_LAYOUT, **(_POSE_LAYOUT if lengths.get("P") else {})}.items():
+        array = data[name]
+        expected = [lengths.setdefault(letter, n) for letter, n in zip(letters, array.shape, strict=False)]
+        if array.dtype.kind != kind or array.ndim != len(letters) or list(array.shape) != expected:
+            raise ValueError(f"{name} is {array.dtype} {list(array.shape)}")
+        if kind == "f" and not name.endswith("stage_ms") and not np.isfinite(array).all():
+            raise ValueError(f"{name} holds numbers that are not finite")
+    parts = data.get("flesh_parts", np.zeros((0, 3)))
+    if parts.size and (parts.min() < 0 or parts.max() >= lengths.get("C", 0)):
+        raise ValueError("flesh_parts names spheres that are not there")
+
+
+def _read_about(path: Path) -> dict[str, Any]:
+    """`run.json`; {} without one."""
+    if not path.is_file():
+        return {}
+    try:
+        about = json_values(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path} cannot be read: {error}") from None
+    except ValueError as error:
+        raise InputError(f"{path}{error}") from None
+    config = about.get("config", {}) if isinstance(about, dict) else None
+    if not isinstance(config, dict) or not all(isinstance(section, dict) for section in config.values()):
+        raise InputError(f"{path}: expected what was run, with its config by sections; run `process` again")
+    return dict(about)
 
 
 def _frames(data: dict[str, NDArray[Any]]) -> list[FrameResult]:

@@ -18,7 +18,8 @@ from limbloc_ros.core.errors import InputError
 from limbloc_ros.core.pose import JOINT, JOINT_NAMES
 from limbloc_ros.export.markers import joints_of_markers
 from limbloc_ros.export.trc import read_trc
-from limbloc_ros.recordings.cases import read_npz
+from limbloc_ros.recordings.cases import joints_of
+from limbloc_ros.recordings.npz_file import read_npz
 from limbloc_ros.recordings.results import Run
 
 Array = NDArray[np.float64]
@@ -163,15 +164,13 @@ def _between(a: Array, b: Array) -> Array:
 
 def _from_npz(path: Path) -> tuple[Array, Array | None]:
     arrays = read_npz(path)
-    if not {"joints", "joint_names"} <= set(arrays):
-        raise InputError(f"{path}: expected joints and joint_names, got {', '.join(arrays) or 'nothing'}")
-    places, names = arrays["joints"].astype(np.float64), tuple(str(n) for n in arrays["joint_names"])
-    if places.ndim != 3 or places.shape[1:] != (len(names), 3):
-        raise InputError(f"{path}: expected joints [F, {len(names)}, 3], got {list(places.shape)}")
+    places, names = joints_of(arrays, path)
     joints = joints_of_markers(names, places)
     if not np.isfinite(joints).any():
         raise InputError(f"{path}: expected joints such as knee_R, got {', '.join(names[:8])}")
     stamps = arrays.get("stamps")
+    if stamps is not None and (stamps.dtype.kind not in "fiu" or stamps.shape != (len(joints),)):
+        raise InputError(f"{path}: expected stamps [{len(joints)}] in s, got {stamps.dtype} {list(stamps.shape)}")
     return joints, None if stamps is None else stamps.astype(np.float64)
 
 

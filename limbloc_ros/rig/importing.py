@@ -71,6 +71,8 @@ def settle(reading: Reading, wishes: Wishes) -> tuple[Rig, list[str]]:
             settles it.
     """
     said = list(reading.notes)
+    if not reading.cameras:
+        raise RigError(f"{reading.source} holds no camera")
     lost = [camera.name for camera in reading.cameras if camera.T is None]
     if lost:
         raise RigError(

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from limbloc_ros.core.camera import Camera, Rig
 from limbloc_ros.core.errors import OutputError, RigError
-from limbloc_ros.rig.plain_values import kind, numbers, required
+from limbloc_ros.rig.plain_values import flattened, kind, numbers, required
 
 Array = NDArray[np.float64]
 
@@ -126,10 +126,9 @@ def pose_from_vectors(rotation: Array, translation: Array) -> Array:
 
 def pose_from_entry(entry: dict[str, Any], rotation: str, translation: str, at: str) -> Array:
     """[4, 4] out of two keys of a mapping: rotation (Rodrigues vector or matrix) and translation."""
-    value = required(entry, rotation, at)
-    flat = np.size(value) == 3 if isinstance(value, list) else False
-    R = numbers(value, (3,) if flat else (3, 3), f"{at}: key {rotation}")
-    t = numbers(np.ravel(required(entry, translation, at)).tolist(), (3,), f"{at}: key {translation}")
+    values = flattened(required(entry, rotation, at))
+    R = numbers(values, (3,) if len(values) == 3 else (3, 3), f"{at}: key {rotation}")
+    t = numbers(flattened(required(entry, translation, at)), (3,), f"{at}: key {translation}")
     return pose_from_vectors(R, t)
 
 

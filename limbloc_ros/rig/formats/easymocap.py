@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import cv2
@@ -18,9 +19,11 @@ from limbloc_ros.rig.formats.common import (
     FoundCamera,
     Reading,
     five_coefficients,
+    image_size,
     polynomial_model,
     pose_from_vectors,
 )
+from limbloc_ros.rig.plain_values import kind, numbers, read_text, required, yaml_values
 
 _FILES = ("intri.yml", "extri.yml")
 
@@ -29,20 +32,17 @@ def read(paths: Sequence[Path]) -> Reading:
     """Read both files: of a folder that holds them, or given one by one."""
     intri, extri = _both(paths)
     notes = []
-    with _Storage(intri) as inner, _Storage(extri) as outer:
-        posed, cameras = outer.names(), []
-        for name in inner.names():
-            if name not in posed:
-                notes.append(f"camera {name} is in {intri.name} only and was left out: it has no pose")
-                continue
-            at = f"{intri}: camera {name}"
-            distortion, lens = polynomial_model(inner.matrix(f"dist_{name}").ravel(), at)
-            rotation = outer.matrix(f"Rot_{name}" if outer.has(f"Rot_{name}") else f"R_{name}")
-            T = pose_from_vectors(rotation, outer.matrix(f"T_{name}").ravel())
-            size = None
-            if inner.has(f"H_{name}") and inner.has(f"W_{name}"):
-                size = (int(inner.number(f"W_{name}")), int(inner.number(f"H_{name}")))
-            cameras.append(FoundCamera(name, size, inner.matrix(f"K_{name}"), distortion, lens, T))
+    inner, outer = _Storage(intri), _Storage(extri)
+    posed, cameras = outer.names(), []
+    for name in inner.names():
+        if name not in posed:
+            notes.append(f"camera {name} is in {intri.name} only and was left out: it has no pose")
+            continue
+        distortion, lens = polynomial_model(inner.matrix(f"dist_{name}"), f"{intri}: camera {name}")
+        rotation = outer.matrix(f"Rot_{name}" if outer.has(f"Rot_{name}") else f"R_{name}", (3, 3), (3,))
+        T = pose_from_vectors(rotation, outer.matrix(f"T_{name}", (3,)))
+        size = inner.size(name) if inner.has(f"H_{name}") and inner.has(f"W_{name}") else None
+        cameras.append(FoundCamera(name, size, inner.matrix(f"K_{name}", (3, 3)), distortion, lens, T))
     if not cameras:
         raise RigError(f"{intri} and {extri} have no camera in common: {', '.join(posed) or 'none'} are posed")
     return Reading(str(intri.parent), tuple(cameras), WORLD_TO_CAMERA, None, "any", notes)
@@ -65,40 +65,47 @@ def _both(paths: Sequence[Path]) -> tuple[Path, Path]:
 
 
 class _Storage:
-    """An OpenCV FileStorage with messages."""
+    """A YAML file of OpenCV's FileStorage. Not read by OpenCV, whose parser crashes on damaged files."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
-
-    def __enter__(self) -> _Storage:
+        text = read_text(path, "calibration", "intri.yml and extri.yml in it")
+        # OpenCV 3 and 4 begin with `%YAML:1.0`, which is no YAML.
+        head, _, rest = text.partition("\n")
         try:
-            self._file = cv2.FileStorage(str(self._path), cv2.FILE_STORAGE_READ)
-        except (cv2.error, SystemError) as error:
-            raise RigError(f"{self._path}: not a YAML file of OpenCV's FileStorage: {error}") from None
-        if not self._file.isOpened():
-            raise RigError(f"{self._path}: not a YAML file of OpenCV's FileStorage")
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._file.release()
+            values = yaml_values(rest if head.startswith("%YAML:") else text)
+        except ValueError as error:
+            raise RigError(f"{path}{error}") from None
+        if not isinstance(values, Mapping):
+            raise RigError(f"{path}: not a YAML file of OpenCV's FileStorage: expected names, ..., got {kind(values)}")
+        self._values = values
 
     def names(self) -> list[str]:
-        node = self._file.getNode("names")
-        if node.empty():
-            raise RigError(f"{self._path}: expected the list names, it is missing")
-        return [node.at(i).string() for i in range(node.size())]
+        names = self._values.get("names")
+        if not isinstance(names, list):
+            raise RigError(f"{self._path}: expected the list names, got {kind(names)}")
+        return [str(name) for name in names]
 
     def has(self, key: str) -> bool:
-        return not self._file.getNode(key).empty()
+        return key in self._values
 
-    def number(self, key: str) -> float:
-        return float(self._file.getNode(key).real())
+    def size(self, name: str) -> tuple[int, int]:
+        """Width and height of a camera's images, px."""
+        return image_size([self._values[f"W_{name}"], self._values[f"H_{name}"]], f"{self._path}: W_{name}, H_{name}")
 
-    def matrix(self, key: str) -> NDArray[np.float64]:
-        value = None if not self.has(key) else self._file.getNode(key).mat()
-        if value is None:
-            raise RigError(f"{self._path}: expected the matrix {key}, it is missing")
-        return np.asarray(value, dtype=np.float64)
+    def matrix(self, key: str, *shapes: tuple[int, ...]) -> NDArray[np.float64]:
+        """A matrix; of any size, or of one of the sizes `shapes`, each of another number of elements."""
+        entry, at = self._values.get(key), f"{self._path}: matrix {key}"
+        if not isinstance(entry, Mapping):
+            raise RigError(f"{at}: expected rows, cols, dt and data, got {kind(entry)}")
+        values = numbers(required(entry, "data", at), None, at)
+        for shape in shapes:
+            if values.size == math.prod(shape):
+                return values.reshape(shape)
+        if shapes:
+            wanted = " or ".join("x".join(map(str, shape)) for shape in shapes)
+            raise RigError(f"{at}: expected {wanted} numbers, got {values.size}")
+        return values
 
 
 def write(rig: Rig, path: Path) -> list[str]:

@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -100,7 +101,7 @@ def write(rig: Rig, path: Path) -> list[str]:
             f"  distortion_model: {lens}",
             f"  intrinsics: {row([K[0, 0], K[1, 1], K[0, 2], K[1, 2]])}",
             f"  resolution: [{camera.width}, {camera.height}]",
-            f"  rostopic: /{camera.name}/image_raw",
+            f"  rostopic: {json.dumps(f'/{camera.name}/image_raw')}",
         ]
     write_text(path, "\n".join(lines) + "\n")
     return ["a camchain holds no world: where the floor is and what is up are lost, and so is the carve volume"]

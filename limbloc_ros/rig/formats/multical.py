@@ -27,7 +27,7 @@ from limbloc_ros.rig.formats.common import (
     pose_from_entry,
     write_text,
 )
-from limbloc_ros.rig.plain_values import kind, numbers, parse, read_text, required
+from limbloc_ros.rig.plain_values import flattened, kind, numbers, parse, read_text, required
 
 
 def read(paths: Sequence[Path]) -> Reading:
@@ -41,10 +41,12 @@ def read(paths: Sequence[Path]) -> Reading:
     cameras = []
     for name, entry in entries.items():
         at = f"{path}: cameras.{name}"
+        if not isinstance(entry, Mapping):
+            raise RigError(f"{at}: expected image_size, K, dist, got {kind(entry)}")
         model = entry.get("model", "standard")
         if model not in ("standard", "rational", "thin_prism", "tilted"):
             raise RigError(f"{at}: key model: expected standard, rational, thin_prism or tilted, got {kind(model)}")
-        dist = numbers(np.ravel(required(entry, "dist", at)).tolist(), None, f"{at}: key dist")
+        dist = numbers(flattened(required(entry, "dist", at)), None, f"{at}: key dist")
         coefficients, lens = polynomial_model(dist, f"{at}: key dist")
         cameras.append(
             FoundCamera(
@@ -65,7 +67,9 @@ def _poses(entries: Any, names: list[str], source: str) -> dict[str, Any]:
         raise RigError(f"{source}: key camera_poses: expected poses by camera, got {kind(entries)}")
     links = {}
     for key, entry in entries.items():
-        T = pose_from_entry(entry, "R", "T", f"{source}: camera_poses.{key}")
+        if not isinstance(entry, Mapping):
+            raise RigError(f"{source}: camera_poses.{key}: expected R and T, got {kind(entry)}")
+        T = pose_from_entry(dict(entry), "R", "T", f"{source}: camera_poses.{key}")
         pairs = [(a, b) for a in names for b in names if key == f"{a}_to_{b}"]
         if key not in names and len(pairs) != 1:
             raise RigError(f"{source}: camera_poses.{key}: expected CAMERA or CAMERA_to_CAMERA of {', '.join(names)}")

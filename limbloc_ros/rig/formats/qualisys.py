@@ -26,7 +26,7 @@ from limbloc_ros.rig.formats.common import (
     polynomial_model,
     write_text,
 )
-from limbloc_ros.rig.plain_values import read_text
+from limbloc_ros.rig.plain_values import read_text, usable
 
 #: Qualisys counts in 64 parts of a pixel.
 SUBPIXELS = 64.0
@@ -40,11 +40,11 @@ def read(paths: Sequence[Path]) -> Reading:
     text = read_text(path, "calibration", "the .qca.txt in it")
     try:
         root = ET.fromstring(text)
-    except ET.ParseError as error:
+    except (ET.ParseError, ValueError) as error:  # ValueError: an encoding that Python does not know
         raise RigError(f"calibration {path}: not valid XML: {error}") from None
     entries = root.findall("cameras/camera")
-    if not entries:
-        raise RigError(f"calibration {path}: expected <cameras><camera ...>, found no camera")
+    if not any(entry.get("active", "1") == "1" for entry in entries):
+        raise RigError(f"calibration {path}: expected <cameras><camera ...>, found no active camera")
     notes = []
     inactive = [_serial(entry, i) for i, entry in enumerate(entries) if entry.get("active", "1") != "1"]
     if inactive:
@@ -89,7 +89,7 @@ def _floats(entry: ET.Element, tag: str, keys: Sequence[str], at: str) -> NDArra
             values.append(float(text if text is not None else "missing"))
         except ValueError:
             raise RigError(f"{at}: <{tag}> {key}: expected a number, got {text!r}") from None
-    return np.array(values)
+    return usable(np.array(values), f"{at}: <{tag}>")
 
 
 def write(rig: Rig, path: Path) -> list[str]:

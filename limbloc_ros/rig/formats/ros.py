@@ -7,6 +7,7 @@ down (REP-103), a camera body's frame looks along x with z up.
 
 from __future__ import annotations
 
+import json
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -14,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -22,7 +22,7 @@ from limbloc_ros.core.camera import Camera, Rig
 from limbloc_ros.core.errors import RigError
 from limbloc_ros.rig.formats.common import CAMERA_TO_WORLD, Format, FoundCamera, Reading, row, write_text
 from limbloc_ros.rig.geometry import inverse
-from limbloc_ros.rig.plain_values import kind, numbers, parse, read_text, required
+from limbloc_ros.rig.plain_values import kind, numbers, parse, read_text, required, yaml_values
 from limbloc_ros.rig.rig_file import MODEL_ALIASES
 
 Array = NDArray[np.float64]
@@ -81,9 +81,9 @@ def read_transforms(path: Path) -> Transforms:
     if commands:
         return dict(_from_command(line, str(path)) for line in commands)
     try:
-        documents = [d for d in yaml.safe_load_all(text) if d is not None]
-    except yaml.YAMLError as error:
-        raise RigError(f"transforms {path}: not valid YAML: {error}") from None
+        documents = [d for d in yaml_values(text, several=True) if d is not None]
+    except ValueError as error:
+        raise RigError(f"transforms {path}{error}") from None
     entries: list[Any] = []
     for document in documents:
         if isinstance(document, Mapping) and "transforms" in document:
@@ -229,7 +229,7 @@ def write(rig: Rig, path: Path) -> list[str]:
         q = Rotation.from_matrix(np.array(T[:3, :3])).as_quat()
         transforms += [
             "- header: {frame_id: room}",
-            f"  child_frame_id: {camera.name}_optical_frame",
+            f"  child_frame_id: {json.dumps(camera.name + '_optical_frame')}",
             "  transform:",
             f"    translation: {{x: {float(T[0, 3])!r}, y: {float(T[1, 3])!r}, z: {float(T[2, 3])!r}}}",
             f"    rotation: {{x: {float(q[0])!r}, y: {float(q[1])!r}, z: {float(q[2])!r}, w: {float(q[3])!r}}}",
@@ -254,7 +254,7 @@ def write_intrinsics(camera: Camera, path: Path) -> None:
     lines = [
         f"image_width: {camera.width}",
         f"image_height: {camera.height}",
-        f"camera_name: {camera.name}",
+        f"camera_name: {json.dumps(camera.name)}",
         f"distortion_model: {names[camera.distortion_model]}",
     ]
     for key, values in blocks:

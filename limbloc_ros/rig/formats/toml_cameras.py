@@ -7,6 +7,7 @@ aniposelib writes the unit of the board's squares, mostly millimetres: the file 
 
 from __future__ import annotations
 
+import json
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -38,7 +39,7 @@ def read(paths: Sequence[Path]) -> Reading:
     path = only_file(paths, "a camera TOML")
     try:
         data = tomllib.loads(read_text(path, "calibration", "the .toml in it"))
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:  # ValueError also: a number of 5000 digits
         raise RigError(f"calibration {path}: not valid TOML: {error}") from None
     nested = data.get("cameras")
     entries: Mapping[str, Any] = nested if isinstance(nested, Mapping) else data
@@ -61,7 +62,7 @@ def _camera(name: str, entry: Mapping[str, Any], at: str) -> FoundCamera:
     else:
         distortion, lens = polynomial_model(distortion, f"{at}: key distortions")
     posed = "rotation" in entry or "translation" in entry
-    if posed and (entry["rotation"] == "null" or entry.get("translation") == "null"):
+    if "null" in (entry.get("rotation"), entry.get("translation")):
         raise RigError(f"{at}: it has no pose (null): finish the extrinsic calibration first")
     return FoundCamera(
         name,
@@ -91,7 +92,7 @@ def write(rig: Rig, path: Path) -> list[str]:
     """Write aniposelib's and Pose2Sim's layout, in metres."""
     lines: list[str] = []
     for i, camera in enumerate(rig.cameras):
-        lines += [f"[cam_{i}]", f'name = "{camera.name}"', *_lines(camera, "aniposelib's TOML"), ""]
+        lines += [f"[cam_{i}]", f"name = {json.dumps(camera.name)}", *_lines(camera, "aniposelib's TOML"), ""]
     write_text(path, "\n".join([*lines, "[metadata]", "adjusted = false", "error = 0.0", ""]))
     return ["the TOML holds no carve volume and no regions to ignore; lengths are metres"]
 
