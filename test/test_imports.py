@@ -55,6 +55,7 @@ CORE_ORDER = (
     "ros4hri",
     "confidence",
     "pipeline",
+    "people",
 )
 
 #: What each package may import from outside the standard library.

@@ -262,6 +262,14 @@ class ContinuousAngles:
         """Forget the last frame."""
         self._last = None
 
+    def snapshot(self) -> tuple[dict[str, float] | None, int]:
+        """What `restore` needs to go on in another process: the last pose's angles and its stamp, ns."""
+        return None if self._last is None else dict(self._last), self._last_ns
+
+    def restore(self, angles: Mapping[str, float] | None, stamp_ns: int) -> None:
+        """Go on after a snapshot."""
+        self._last, self._last_ns = angles, stamp_ns
+
 
 def native_rotations(angles: Mapping[str, float]) -> Array:
     """The inverse of `native_angles`: each bone's rotation [B, 3, 3] in its parent (the pelvis in the world)."""

@@ -14,7 +14,7 @@ from limbloc_ros.core.camera import Camera, Rig
 from limbloc_ros.core.confidence import describe_pose
 from limbloc_ros.core.config import FitConfig, HullConfig, validated
 from limbloc_ros.core.errors import NoPerson
-from limbloc_ros.core.hull import Hull, carve_silhouettes
+from limbloc_ros.core.hull import Hull, carve_silhouettes, largest_component
 from limbloc_ros.core.pose import Pose
 from limbloc_ros.core.silhouettes import measure_silhouettes, pack_cameras
 from limbloc_ros.core.surface import extract_surface
@@ -49,7 +49,7 @@ class Carver:
 
 
 class PoseEstimator:
-    """The fitting half: hull -> pose.
+    """The fitting half: hull -> pose of one person; `people.People` has one for each.
 
     Every frame is fitted alone (paper section 4) unless `config.temporal`: then the last frame's figure is the first
     guess, and a fit that is clearly worse than the last ones is done again from scratch.
@@ -60,9 +60,10 @@ class PoseEstimator:
         self._tracker = Tracker(self.config.seed)
 
     def estimate(self, hull: Hull) -> Pose | NoPerson:
-        """Fit the figure to one hull."""
+        """Fit the figure to one hull; of a hull in several parts to the largest."""
         if hull.inside_count == 0:
             return NoPerson("the hull holds no voxel: is anybody in the carve volume?")
+        hull = largest_component(hull)
         clock = _Stopwatch()
         if self.config.engine == "paper":
             found = engine_paper.fit_state(hull)
