@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from limbloc_ros.core import _background_kernels as kernels
-from limbloc_ros.core.background import PATIENCE, BackgroundModel, estimate_background
+from limbloc_ros.core.background import MOVED_PATIENCE, PATIENCE, BackgroundModel
+from limbloc_ros.core.background_estimate import estimate_background
 from limbloc_ros.core.config import BackgroundConfig
 from limbloc_ros.core.errors import ConfigError, InputError
 from limbloc_ros.core.mask_cleaning import clean_mask
@@ -28,6 +29,20 @@ def room(rng, noise=1.0, light=1.0, shape=(HEIGHT, WIDTH)):
     pattern = 1 + 0.2 * np.sin(x / 17) * np.cos(y / 23)
     image = COLOUR * pattern[..., None] * light + rng.normal(0, noise, (*shape, 3))
     return np.clip(np.rint(image), 0, 255).astype(np.uint8)
+
+
+def textured(rng):
+    """A room with furniture: rectangles of many colours."""
+    image = np.full((HEIGHT, WIDTH, 3), COLOUR)
+    for _ in range(40):
+        y, x = rng.integers(0, (HEIGHT - 10, WIDTH - 10))
+        image[y : y + rng.integers(5, 30), x : x + rng.integers(5, 30)] = rng.integers(40, 200, 3)
+    return image.astype(np.uint8)
+
+
+def noisy(rng, picture):
+    """What a camera makes of a scene."""
+    return np.clip(picture + rng.normal(0, 1.0, picture.shape), 0, 255).astype(np.uint8)
 
 
 def learned(rng, config=None, **kwargs):
@@ -409,31 +424,77 @@ class TestScenes:
         truth[PERSON] = True
         assert iou(model.segment(image).mask > 0, truth) > 0.97
 
-    def test_another_lamp_is_said_and_learned(self):
+    def test_another_lamp_is_said_and_followed_with_somebody_in_the_room(self):
         rng = np.random.default_rng(5)
         model = learned(rng, BackgroundConfig(learning_frames=5))
 
-        def evening():  # light from the side, of another colour
+        def evening(column):  # light from the side, of another colour
             slope = np.linspace(0.2, 1.6, WIDTH)[None, :, None] * (0.5, 0.9, 1.3)
-            return np.clip(room(rng) * slope, 0, 255).astype(np.uint8)
+            image = room(rng) * slope
+            image[30:70, column : column + 20] = (30, 160, 60)
+            return np.clip(image, 0, 255).astype(np.uint8)
 
-        for n in range(PATIENCE + 5 - 1):
-            result = model.segment(evening())
-            assert result.learning
-            assert not result.mask.any()
-            assert result.light_jump is (n < PATIENCE)
-        image = evening()
-        image[PERSON] = (30, 250, 60)
+        image = room(rng)
+        image[PERSON] = (30, 160, 60)
+        model.segment(image)
+        for n in range(PATIENCE):
+            result = model.segment(evening(50))
+            assert result.light_jump is (n < PATIENCE - 1)
+        assert (model.relit, result.learning) == (1, False)
+        for column in (50, 52, 80):  # the last one: he went, and left no ghost behind
+            truth = np.zeros((HEIGHT, WIDTH), dtype=bool)
+            truth[30:70, column : column + 20] = True
+            assert iou(model.segment(evening(column)).mask > 0, truth) > 0.9
+        # The first light is back: so is its background, at once, and he is seen.
+        image = room(rng)
+        image[PERSON] = (30, 160, 60)
         result = model.segment(image)
-        assert not result.learning
-        assert 0.5 < result.foreground_fraction / (40 * 20 / (HEIGHT * WIDTH)) < 1.1
+        assert (model.relit, result.light_jump) == (2, False)
+        assert np.count_nonzero(result.mask) == pytest.approx(800, rel=0.1)
+
+    def test_a_moved_camera_gives_no_mask_until_it_is_back(self):
+        rng = np.random.default_rng(6)
+        picture = textured(rng)
+        model = BackgroundModel(BackgroundConfig(learning_frames=5))
+        for _ in range(5):
+            model.segment(noisy(rng, picture))
+        for n in range(PATIENCE + MOVED_PATIENCE + 5):
+            result = model.segment(noisy(rng, np.roll(picture, 30, axis=1)))
+            assert result.light_jump
+            assert result.moved is (n >= PATIENCE - 1)
+            assert not result.mask.any()
+        image = noisy(rng, picture)
+        image[PERSON] = (30, 160, 60)
+        result = model.segment(image)
+        assert not result.moved
+        assert np.count_nonzero(result.mask) == pytest.approx(800, rel=0.1)
+
+    @pytest.mark.parametrize("level", [0, 255])
+    def test_a_covered_lens_is_said_and_costs_nothing(self, level):
+        rng = np.random.default_rng(6)
+        picture, nothing = textured(rng), np.full((HEIGHT, WIDTH, 3), level, dtype=np.uint8)
+        model = BackgroundModel(BackgroundConfig(learning_frames=5))
+        assert model.segment(noisy(rng, nothing)).blind  # nor is it learned
+        for _ in range(5):
+            assert model.segment(noisy(rng, picture)).learning
+        for _ in range(20):
+            result = model.segment(noisy(rng, nothing))
+            assert (result.blind, result.moved, result.light_jump, bool(result.mask.any())) == (
+                True,
+                False,
+                False,
+                False,
+            )
+        image = noisy(rng, picture)
+        image[PERSON] = (30, 160, 60)
+        assert np.count_nonzero(model.segment(image).mask) == pytest.approx(800, rel=0.1)
 
     def test_a_flash_does_not_cost_the_background(self):
         rng = np.random.default_rng(6)
         model = learned(rng)
         for _ in range(3):
             for _ in range(PATIENCE - 1):
-                assert model.segment(np.full((HEIGHT, WIDTH, 3), 255, dtype=np.uint8)).light_jump
+                assert model.segment(255 - textured(rng)).light_jump
             result = model.segment(room(rng))
             assert not result.learning
             assert not result.mask.any()

@@ -33,6 +33,8 @@ CORE_ORDER = (
     "images",
     "synchroniser",
     "mask_cleaning",
+    "relight",
+    "background_estimate",
     "background",
     "silhouettes",
     "hull",

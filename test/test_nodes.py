@@ -199,6 +199,50 @@ def test_segmentation_survives_bad_images_and_says_so(graph: Graph, kind: str, w
     graph.until(lambda: len(masks) == 2)
 
 
+def test_a_frozen_camera_is_named_and_its_masks_are_left_out(graph: Graph) -> None:
+    graph.add(SegmentationNode, camera="cam0", background__learning_frames=LEARNING, reliability="reliable")
+    masks, diagnostics = graph.collect(Image, "cam0/mask"), graph.diagnostics()
+    images = graph.publisher(Image, "cam0/image_raw")
+    room = Room()
+    for n in range(LEARNING):
+        images.publish(pixels_to_image(room.picture(box=False), header(n)))
+    frozen = room.picture(box=True)
+    per_second = round(1e9 / FRAME_NS)
+    for n in range(LEARNING, LEARNING + 2 * per_second):
+        images.publish(pixels_to_image(frozen, header(n)))
+        graph.spin(0.005)
+    graph.until(diagnostics.says("segmentation: mask", "the very same picture", "frozen"))
+    assert len(masks) == LEARNING + per_second + 1
+    last = LEARNING + 2 * per_second
+    images.publish(pixels_to_image(room.picture(box=True), header(last)))
+    graph.until(lambda: stamp_ns(masks[-1].header) == stamp_ns(header(last)))
+    graph.until(diagnostics.says("segmentation: mask", "segmenting"))
+
+
+def test_a_covered_and_a_turned_camera_are_named(graph: Graph) -> None:
+    graph.add(SegmentationNode, camera="cam0", background__learning_frames=LEARNING, reliability="reliable")
+    masks, diagnostics = graph.collect(Image, "cam0/mask"), graph.diagnostics()
+    images = graph.publisher(Image, "cam0/image_raw")
+    rng = np.random.default_rng(2)
+    view = np.kron(rng.integers(30, 220, (12, 16, 3)), np.ones((10, 10, 1)))
+
+    def send(picture: np.ndarray, times: int) -> None:
+        for _ in range(times):
+            before = len(masks)
+            pixels = np.clip(picture + rng.normal(0, 2, picture.shape), 0, 255).astype(np.uint8)
+            images.publish(pixels_to_image(pixels, header(before)))
+            graph.until(lambda before=before: len(masks) == before + 1)
+
+    send(view, LEARNING + 1)
+    send(np.zeros_like(view), 4)
+    graph.until(diagnostics.says("segmentation: mask", "nothing but one brightness", "covered"))
+    send(view[:, ::-1], 5)
+    graph.until(diagnostics.says("segmentation: mask", "another view", "recapture_background"))
+    assert not message_to_mask(masks[-1]).any()
+    send(0.6 * view * (1, 0.9, 0.8), 1)  # the view is back, and the light another one
+    graph.until(diagnostics.says("segmentation: mask", "segmenting"))
+
+
 @pytest.mark.parametrize("as_folder", [True, False])
 def test_segmentation_starts_from_a_picture_of_the_empty_room(graph: Graph, tmp_path: Path, as_folder: bool) -> None:
     room = Room()

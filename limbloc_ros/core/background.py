@@ -8,7 +8,10 @@ nothing. Around this core, because real rooms need it:
 * a shadow darkens a pixel and leaves its colour, so only what a factor `shadow_darkest .. highlight_brightest` on the
   background cannot explain counts as foreground (Horprasert et al. 1999);
 * the evidence is cleaned into a mask by hysteresis, morphology and trimming (`mask_cleaning`);
-* when most of the image changes at once, the light was switched: no mask, and the background is learned anew.
+* when most of the image changes at once, the light was switched or the camera moved: a background of before that fits
+  is taken again; else the old one is brought to the new light (`relight`), whoever is in the room; and when it is
+  another view, there is no mask until the old one is back;
+* an image of one brightness only (a covered lens, a dead sensor) says nothing and changes nothing.
 
 A mask depends on the images given before and on nothing else.
 """
@@ -16,8 +19,8 @@ A mask depends on the images given before and on nothing else.
 from __future__ import annotations
 
 import dataclasses
-import itertools
-from collections.abc import Iterable, Mapping, Sequence
+from collections import deque
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,24 +28,24 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from limbloc_ros.core._background_kernels import (
-    CHANGE_SCALE,
-    LEVEL_SCALE,
-    densest_mean,
-    fix_all,
-    learn,
-    light_gain,
-    measure,
-)
+from limbloc_ros.core._background_kernels import CHANGE_SCALE, fix_all, learn, light_gain, measure
+from limbloc_ros.core.background_estimate import BackgroundEstimate, estimate_background, fixed_levels, noise_variance
 from limbloc_ros.core.config import BackgroundConfig, validated
 from limbloc_ros.core.errors import InputError
 from limbloc_ros.core.mask_cleaning import clean_mask
+from limbloc_ros.core.relight import relight, shows_nothing
 
 Bytes = NDArray[np.uint8]
 Floats = NDArray[np.float32]
 
 PATIENCE = 3
-"""Frames in a row that must disagree with the whole background before it is learned anew (a flash is shorter)."""
+"""Frames in a row that must disagree with the whole background before anything follows (a flash is shorter)."""
+
+FORMER, FITS = 2, 0.3
+"""So many backgrounds of before are kept, and one is taken again when less than this share of the image differs."""
+
+MOVED_PATIENCE = 10
+"""While a camera shows another view, every so many frames it is looked whether only the light has changed as well."""
 
 LEARNED_ROWS = 8
 """Every row of pixels learns from every eighth image, with a rate to match: the same background in less time."""
@@ -52,7 +55,6 @@ RESTLESS_SIGMA, UNREST = 10.0, 0.005
 such pixels from which on somebody must have moved. Empty rooms had none, rooms with somebody who walks 3 to 20 %."""
 
 _RIM = np.ones((5, 5), dtype=np.uint8)
-_GRADIENT_BINS = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, float("inf"))
 
 
 @dataclass(frozen=True)
@@ -65,6 +67,9 @@ class Segmentation:
         frames_learned: images that made the background so far.
         foreground_fraction: part of the image that is foreground, 0 to 1.
         light_jump: most of the image differs from the background: the light was switched or the camera moved.
+        moved: it shows another view than the background: the camera was moved, covered or exchanged. No mask until the
+            view is back, or the background is captured anew.
+        blind: the image shows nothing but one brightness; no mask.
         gain: [3] brightness of the light relative to the learned background, per channel.
     """
 
@@ -74,19 +79,8 @@ class Segmentation:
     foreground_fraction: float
     light_jump: bool
     gain: tuple[float, float, float]
-
-
-@dataclass(frozen=True)
-class BackgroundEstimate:
-    """A background guessed from a recording that shows a person all the time.
-
-    Attributes:
-        mean: float32 [H, W, 3], grey levels.
-        sigma: float32 [H, W, 3] noise, grey levels; 0 where the video repeats itself exactly.
-    """
-
-    mean: Floats
-    sigma: Floats
+    moved: bool = False
+    blind: bool = False
 
 
 class BackgroundModel:
@@ -102,6 +96,8 @@ class BackgroundModel:
         self._image_shape: tuple[int, ...] | None = None
         self._grey = False
         self._frozen = False
+        self._former: deque[tuple[Floats, NDArray[np.float16]]] = deque(maxlen=FORMER)
+        self._relit = 0
         self._forget()
 
     def _forget(self) -> None:
@@ -111,6 +107,7 @@ class BackgroundModel:
         self._sharpness = self._level.copy()
         self._gain = np.ones(3, dtype=np.float32)
         self._busy = np.zeros((0, 0), dtype=np.uint8)
+        self._changed = self._busy
         self._learned = 0
         self._ready = False
         self._noise_known = False
@@ -146,6 +143,11 @@ class BackgroundModel:
         return self._frozen
 
     @property
+    def relit(self) -> int:
+        """How often the background was brought to another light, or one of before was taken again."""
+        return self._relit
+
+    @property
     def background(self) -> Bytes | None:
         """uint8 [h, w, 3] the learned background at working size, or None before the first image."""
         if self._learned == 0:
@@ -159,6 +161,7 @@ class BackgroundModel:
     def recapture(self) -> None:
         """Forget the background; the next `learning_frames` images must be free of people. Any size is accepted."""
         self._forget()
+        self._former.clear()
         self._image_shape = None
 
     def seed(self, images: Bytes | Sequence[Bytes]) -> None:
@@ -241,7 +244,7 @@ class BackgroundModel:
         self._forget()
         self._mean, self._variance, self._gain, self._image_shape = mean, variance, gain, (height, width)
         self._grey, self._noise_known, self._frozen = flags
-        self._busy = np.zeros(mean.shape[1:], dtype=np.uint8)
+        self._busy = self._changed = np.zeros(mean.shape[1:], dtype=np.uint8)
         self._learned, self._ready = learned, True
         self._fix_model()
 
@@ -259,24 +262,31 @@ class BackgroundModel:
             InputError: not an 8-bit image, or another size than before (`recapture` accepts a new size).
         """
         planes = self._working(image)
-        if not self._ready:
+        if not self._ready and shows_nothing(planes, None):
+            return self._no_mask(blind=True)
+        if not self._ready and not self._recall(planes):
             self._learn(planes)
             if self._learned >= self._config.learning_frames:
                 self._finish_learning()
-            return self._no_mask(light_jump=False)
+            return self._no_mask()
         self._gain = light_gain(planes, self._level, self._busy, self._gain, self._stride())
         if not self._noise_known:
             self._estimate_noise(planes)
         change, colour = self._measure(planes)
-        threshold = round(self._config.threshold_sigmas * CHANGE_SCALE)
-        far = cv2.compare(change, threshold, cv2.CMP_GE)
-        if cv2.countNonZero(far) > self._config.relearn_fraction * change.size:
-            return self._light_jumped(planes)
-        self._upset = 0
+        far, share = self._far(change)
+        if share > FITS and shows_nothing(planes, self._mean):
+            return self._no_mask(blind=True)
+        if share > self._config.relearn_fraction:
+            moved = self._light_jumped(planes)
+            if moved is not None:
+                return self._no_mask(light_jump=True, moved=moved)
+            change, colour = self._measure(planes)
+            far, _ = self._far(change)
+        self._upset, self._changed = 0, far
         mask = clean_mask(change, colour, self._config)
         self._busy = cv2.dilate(mask, _RIM)
         if not self._frozen and self._config.learning_rate > 0:
-            self._follow(planes, change, threshold)
+            self._follow(planes, change)
         fraction = cv2.countNonZero(mask) / mask.size
         return Segmentation(self._full_size(mask), False, self._learned, fraction, False, self._gain_tuple())
 
@@ -322,20 +332,20 @@ class BackgroundModel:
 
     def _stride(self) -> int:
         """Sampling of the gain: about 3000 pixels whatever the image's size."""
-        return max(1, int(np.sqrt(self._busy.size / 3000.0)))
+        return max(1, int(np.sqrt(self._mean[0].size / 3000.0)))
 
     def _gain_tuple(self) -> tuple[float, float, float]:
         return float(self._gain[0]), float(self._gain[1]), float(self._gain[2])
 
-    def _no_mask(self, light_jump: bool) -> Segmentation:
+    def _no_mask(self, light_jump: bool = False, moved: bool = False, blind: bool = False) -> Segmentation:
         assert self._image_shape is not None
         mask = np.zeros(self._image_shape, dtype=np.uint8)
-        return Segmentation(mask, True, self._learned, 0.0, light_jump, self._gain_tuple())
+        return Segmentation(mask, True, self._learned, 0.0, light_jump, self._gain_tuple(), moved, blind)
 
     def _allocate(self, planes: Bytes) -> None:
         self._mean = planes.astype(np.float32)
         self._variance = np.zeros_like(self._mean)
-        self._busy = np.zeros(planes.shape[1:], dtype=np.uint8)
+        self._busy = self._changed = np.zeros(planes.shape[1:], dtype=np.uint8)
         self._learned = 1
 
     def _learn(self, planes: Bytes) -> None:
@@ -343,7 +353,7 @@ class BackgroundModel:
         if self._learned == 0:
             self._allocate(planes)
             return
-        gain = light_gain(planes, _fixed(self._mean), self._busy, np.ones(3, dtype=np.float32), self._stride())
+        gain = light_gain(planes, fixed_levels(self._mean), self._busy, np.ones(3, dtype=np.float32), self._stride())
         self._learned += 1
         now = planes.astype(np.float32) / gain[:, None, None]
         before = now - self._mean
@@ -362,23 +372,8 @@ class BackgroundModel:
         self._fix_model()
 
     def _estimate_noise(self, planes: Bytes) -> None:
-        """Take each pixel's noise from how much pixels of equal background contrast differ from the background.
-
-        At edges of the background a tremble of the camera or the codec makes more noise than on plain walls. The
-        median is not disturbed by a person, who covers less than half of each class.
-        """
-        grey = self._mean.mean(axis=0)
-        slope = np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0, scale=0.125), cv2.Sobel(grey, cv2.CV_32F, 0, 1, scale=0.125))
-        slope = cv2.dilate(slope, np.ones((3, 3), dtype=np.uint8))
-        off = np.abs(planes.astype(np.float32) - self._mean * self._gain[:, None, None])
-        for low, high in itertools.pairwise(_GRADIENT_BINS):
-            where = (slope >= low) & (slope < high)
-            if np.count_nonzero(where) < 100:
-                where = slope >= low if low > 0 else np.ones_like(where)
-            for c in range(3):
-                sigma = 1.4826 * float(np.median(off[c][where])) if where.any() else 0.0
-                here = (slope >= low) & (slope < high)
-                self._variance[c][here] = np.maximum(self._variance[c][here], np.float32(sigma * sigma))
+        """Take each pixel's noise from one image: the background has none yet."""
+        self._variance = np.maximum(self._variance, noise_variance(planes, self._mean, self._gain))
         self._noise_known = True
         self._fix_model()
 
@@ -410,7 +405,7 @@ class BackgroundModel:
         )
         return change, colour
 
-    def _follow(self, planes: Bytes, change: Bytes, threshold: int) -> None:
+    def _follow(self, planes: Bytes, change: Bytes) -> None:
         """Let the background pixels of this image's share of rows learn."""
         weight, floor = self._weight_and_floor()
         learn(
@@ -422,7 +417,7 @@ class BackgroundModel:
             self._gain,
             self._busy,
             change,
-            np.float32(threshold),
+            np.float32(self._threshold()),
             np.float32(1.0 - (1.0 - self._config.learning_rate) ** LEARNED_ROWS),
             floor,
             weight,
@@ -431,52 +426,64 @@ class BackgroundModel:
         )
         self._turn = (self._turn + 1) % LEARNED_ROWS
 
-    def _light_jumped(self, planes: Bytes) -> Segmentation:
+    def _threshold(self) -> int:
+        return round(self._config.threshold_sigmas * CHANGE_SCALE)
+
+    def _far(self, change: Bytes) -> tuple[Bytes, float]:
+        """Where the image is not the background [h, w], and the share of it."""
+        far = np.asarray(cv2.compare(change, self._threshold(), cv2.CMP_GE), dtype=np.uint8)
+        return far, cv2.countNonZero(far) / far.size
+
+    def _light_jumped(self, planes: Bytes) -> bool | None:
+        """Most of the image differs. None when there is a background for it now; else whether the camera has moved."""
         self._upset += 1
-        if self._upset >= PATIENCE and not self._frozen:
+        if self._frozen:
+            return False
+        if self._recall(planes):
+            return None
+        if self._upset < PATIENCE or (self._upset - PATIENCE) % MOVED_PATIENCE:
+            return self._upset > PATIENCE
+        found = relight(planes, self._mean, self._changed | self._busy)
+        if found.other_view:
+            return True
+        self._keep(self._mean, self._variance)
+        if not found.same_view:
             self._forget()
             self._learn(planes)
-            if self._learned >= self._config.learning_frames:
-                self._finish_learning()
-        return self._no_mask(light_jump=True)
+            return False
+        self._relit += 1
+        brighter = np.clip(found.mean / np.maximum(self._mean, 1.0), 1.0, 3.0)
+        self._variance *= brighter * brighter  # noise grows with the light, if it does
+        self._mean = found.mean
+        self._gain = np.ones(3, dtype=np.float32)
+        self._fix_model()
+        return None
 
+    def _keep(self, mean: Floats, variance: Floats) -> None:
+        """Put a background by: its light may come back."""
+        self._former.append((mean.copy(), np.minimum(variance, 6e4).astype(np.float16)))
 
-def estimate_background(frames: Iterable[Bytes], share: float = 0.4) -> BackgroundEstimate:
-    """Guess the empty room from frames in which a person is always somewhere.
-
-    Each pixel takes the mean of the tightest brightness interval that holds `share` of its samples (a mode), after
-    the frames were brought to one light.
-
-    Limitation: a person (or a part: feet, a torso that hardly moves) who covers a pixel for more than about half of
-    the recording becomes background there, and is missing from every mask: use frames spread over the whole
-    recording, 15 to 60 of them, and prefer a picture of the empty room when there is one.
-
-    Args:
-        frames: uint8 [H, W, 3] or [H, W] of one camera.
-        share: part of the samples that the interval must hold, 0 to 1.
-
-    Raises:
-        InputError: fewer than three frames, or unequal sizes.
-    """
-    stack = [cv2.cvtColor(f, cv2.COLOR_GRAY2BGR) if f.ndim == 2 else f for f in frames]
-    if len(stack) < 3:
-        raise InputError(f"expected at least 3 frames to guess a background from, got {len(stack)}; use more frames")
-    shapes = {f.shape for f in stack}
-    if len(shapes) > 1:
-        raise InputError(f"expected frames of one size, got {sorted(shapes)}; each camera needs its own background")
-    samples = np.stack(stack)
-    spread = samples[np.linspace(0, len(samples) - 1, min(len(samples), 9)).round().astype(int)]
-    middle = np.ascontiguousarray(_fixed(np.median(spread, axis=0)).transpose(2, 0, 1))
-    nobody = np.zeros(middle.shape[1:], dtype=np.uint8)
-    ones = np.ones(3, dtype=np.float32)
-    gains = np.stack([light_gain(np.ascontiguousarray(f.transpose(2, 0, 1)), middle, nobody, ones, 4) for f in samples])
-    mean, sigma = densest_mean(samples, gains, share)
-    return BackgroundEstimate(mean, sigma)
-
-
-def _fixed(grey_levels: NDArray[np.floating[Any]]) -> NDArray[np.uint16]:
-    """Means in the kernels' fixed point."""
-    return np.asarray(np.rint(grey_levels * LEVEL_SCALE), dtype=np.uint16)
+    def _recall(self, planes: Bytes) -> bool:
+        """Take a background of before that fits the image again."""
+        kept = self._mean, self._variance, self._gain
+        for n, former in reversed(list(enumerate(self._former))):
+            self._mean, self._variance = former[0], former[1].astype(np.float32)
+            self._fix_model()
+            nobody = np.zeros(self._mean.shape[1:], dtype=np.uint8)
+            self._gain = light_gain(planes, self._level, nobody, np.ones(3, dtype=np.float32), self._stride())
+            if self._far(self._measure(planes)[0])[1] > FITS:
+                continue
+            del self._former[n]
+            if self._ready:
+                self._keep(*kept[:2])
+            self._busy = self._changed = nobody
+            self._learned, self._ready, self._noise_known = max(self._learned, 1), True, True
+            self._upset, self._relit = 0, self._relit + 1
+            return True
+        if self._former:
+            self._mean, self._variance, self._gain = kept
+            self._fix_model()
+        return False
 
 
 def warm_up() -> None:

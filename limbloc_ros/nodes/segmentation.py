@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.node import Node
 from sensor_msgs.msg import CompressedImage, Image
@@ -23,12 +24,15 @@ from limbloc_ros.recordings.background_file import load_background, save_backgro
 from limbloc_ros.recordings.videos import pictures_in, read_picture
 from limbloc_ros.ros import image_messages, node_main, topics
 from limbloc_ros.ros.backlog import Backlog
-from limbloc_ros.ros.health import Health, Meter
-from limbloc_ros.ros.messages import ERROR, OK, WARN, make_header, make_status, stamp_ns
+from limbloc_ros.ros.health import WINDOW_S, Health, Meter
+from limbloc_ros.ros.messages import ERROR, NANOSECONDS, OK, WARN, make_header, make_status, stamp_ns
 from limbloc_ros.ros.parameters import NodeParameters
 
 #: Longer without an image is worth a warning.
 SILENT_S = 2.0
+
+#: A camera that sends the very same picture for this long (by its stamps) is frozen: a live sensor has noise.
+FROZEN_S = 1.0
 
 #: The background follows the light; so often what is kept of it does too.
 SAVE_PERIOD_S = 60.0
@@ -76,6 +80,10 @@ class SegmentationNode(Node):
         self.state_file = Path(folder) / f"{self.settings.camera}.npz" if folder else None
         self.saved_s: float | None = None
         self.last: Segmentation | None = None
+        self.last_pixels: Pixels | None = None
+        self.same_since_ns: int | None = None
+        self.frozen_s = 0.0
+        self.relit_s = -WINDOW_S
         self.meter = Meter()
         self.segment_ms = float("nan")
         self.backlog: Backlog[Image | CompressedImage] = Backlog(
@@ -113,15 +121,29 @@ class SegmentationNode(Node):
         """Segment one image, publish its mask with the image's stamp and frame."""
         started = time.thread_time()
         with self.health.guard(f"camera {self.settings.camera}"):
-            self.last = self.model.segment(image_messages.message_to_pixels(msg))
+            pixels = image_messages.message_to_pixels(msg)
+            stamp, relit = stamp_ns(msg.header), self.model.relit
+            self.watch_for_freeze(pixels, stamp)
+            self.last = self.model.segment(pixels)
+            if self.model.relit > relit:
+                self.relit_s = time.monotonic()
+            self.meter.tick(self.health.latency_s(stamp))
+            if self.frozen_s > FROZEN_S and self.last.mask.any():
+                return  # an old silhouette would cut the hull of who has moved since
             always = self.settings.publish == "always"
             if always or self.raw_mask.get_subscription_count():
                 self.raw_mask.publish(image_messages.mask_to_image(self.last.mask, msg.header))
             if always or self.png_mask.get_subscription_count():
                 self.png_mask.publish(image_messages.mask_to_compressed(self.last.mask, msg.header))
-            self.meter.tick(self.health.latency_s(stamp_ns(msg.header)))
             self.save_background()
             self.segment_ms = 1e3 * (time.thread_time() - started)
+
+    def watch_for_freeze(self, pixels: Pixels, stamp: int) -> None:
+        """Count for how long (by stamps, ns) the camera has sent the same picture."""
+        if self.last_pixels is None or not np.array_equal(pixels, self.last_pixels):
+            self.same_since_ns = stamp
+        self.last_pixels = pixels
+        self.frozen_s = (stamp - self.same_since_ns) / NANOSECONDS if self.same_since_ns is not None else 0.0
 
     def restore_background(self) -> None:
         """Go on with the background of the process before, if there was one."""
@@ -169,11 +191,27 @@ class SegmentationNode(Node):
         if self.last is not None:
             fill = 100.0 * self.last.foreground_fraction
             wanted = self.model.config.learning_frames
-            if self.last.light_jump:
+            if self.last.blind:
+                level, message = (
+                    ERROR,
+                    "the images show nothing but one brightness: is the lens covered, the light off?",
+                )
+            elif self.last.moved:
+                level = ERROR
+                message = (
+                    "the camera shows another view than its background: was it moved, covered or exchanged? There are "
+                    "no masks until the view is back; if it is to stay, calibrate anew and call "
+                    f"{self.get_name()}/recapture_background"
+                )
+            elif self.last.light_jump:
                 level, message = WARN, "most of the image changed at once: was the light switched or the camera moved?"
             elif self.last.learning:
                 progress = f"{self.last.frames_learned} of {wanted} images"
                 level, message = WARN, f"learning the background ({progress}): keep the room empty"
+        if level == OK and self.frozen_s > FROZEN_S:
+            level, message = ERROR, f"the camera has sent the very same picture for {self.frozen_s:.0f} s: it is frozen"
+        if level == OK and time.monotonic() - self.relit_s < WINDOW_S:
+            level, message = WARN, "the light was switched: the background was brought to the new light"
         if level == OK and self.model.unrest > UNREST:
             level = WARN
             message = (
@@ -195,6 +233,7 @@ class SegmentationNode(Node):
             "mask_fill_percent": fill,
             "learning": self.model.learning,
             "frozen": self.model.frozen,
+            "times_relit": self.model.relit,
         }
         return [make_status(f"{self.get_name()}: mask", level, message, values, self.settings.camera)]
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from limbloc_ros.core.background import estimate_background
+from limbloc_ros.core.background_estimate import estimate_background
 from limbloc_ros.core.camera import Rig
 from limbloc_ros.core.errors import InputError
 from limbloc_ros.recordings.sources import (
