@@ -143,6 +143,32 @@ def test_a_dead_camera_is_named_and_the_others_go_on(graph: Graph, rig: Rig, rig
     graph.until(lambda: cameras.diagnostics.value("carving: camera cam3", "missing") == "7")
 
 
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [("late", ["ms older", "late"]), ("clock", ["ms younger", "clock is off"]),
+     ("half", ["masks a second, the other cameras"]), ("again", ["the same stamps again and again"])],
+)  # fmt: skip
+def test_why_a_camera_is_missing_from_the_sets(
+    graph: Graph, rig: Rig, rig_file: str, person: Masks, fault: str, words: list[str]
+) -> None:
+    graph.add(CarvingNode, rig_file=rig_file, sync__timeout_s=0.05)
+    cameras = Cameras(graph, rig.names)
+    three = {name: person[name] for name in rig.names[:3]}
+    period_ns, now_ns = 80_000_000, time.time_ns()
+    started = time.monotonic()
+    for n in range(16):
+        for name, mask in three.items():
+            cameras.publishers[name].publish(mask_to_compressed(mask, make_header(now_ns + n * period_ns, "")))
+        shown = {"late": n - 6, "clock": n, "half": n if n % 2 else -1, "again": 0}[fault]
+        if shown >= 0:
+            stamp = now_ns + shown * period_ns + (40_000_000 if fault == "clock" else 0)
+            cameras.publishers["cam3"].publish(mask_to_compressed(person["cam3"], make_header(stamp, "")))
+        graph.spin(max(started + (n + 1) * period_ns / 1e9 - time.monotonic(), 0.0))
+    status = cameras.diagnostics["carving: camera cam3"]
+    assert status is not None and all(word in status.message for word in ("missing in", *words)), status
+    assert not cameras.diagnostics.says("carving: camera cam0", "missing in")()
+
+
 def test_fewer_masks_than_min_cameras_give_no_hull(graph: Graph, rig: Rig, rig_file: str, person: Masks) -> None:
     graph.add(CarvingNode, rig_file=rig_file, hull__min_cameras=4)
     cameras = Cameras(graph, rig.names)
@@ -191,6 +217,7 @@ def test_a_looped_bag_goes_on_after_the_jump_back(graph: Graph, rig: Rig, rig_fi
     for n in (50, 51, 0, 1):
         assert cameras.hull(person, n) is not None
     graph.until(lambda: cameras.diagnostics.value("carving: hull", "jumps_back_in_time") == "1")
+    graph.until(cameras.diagnostics.says("carving: hull", "jumped back in time"))
 
 
 def test_a_slow_machine_skips_whole_sets_and_carves_the_newest(

@@ -81,7 +81,7 @@ class SegmentationNode(Node):
         self.saved_s: float | None = None
         self.last: Segmentation | None = None
         self.last_pixels: Pixels | None = None
-        self.same_since_ns: int | None = None
+        self.same_since_ns = 0
         self.frozen_s = 0.0
         self.relit_s = -WINDOW_S
         self.meter = Meter()
@@ -143,7 +143,7 @@ class SegmentationNode(Node):
         if self.last_pixels is None or not np.array_equal(pixels, self.last_pixels):
             self.same_since_ns = stamp
         self.last_pixels = pixels
-        self.frozen_s = (stamp - self.same_since_ns) / NANOSECONDS if self.same_since_ns is not None else 0.0
+        self.frozen_s = (stamp - self.same_since_ns) / NANOSECONDS
 
     def restore_background(self) -> None:
         """Go on with the background of the process before, if there was one."""

@@ -3,6 +3,10 @@
 
 from __future__ import annotations
 
+import copy
+import statistics
+import time
+from collections import deque
 from collections.abc import Mapping, Sequence
 
 import cv2
@@ -16,11 +20,15 @@ from limbloc_ros.core.images import Pixels
 from limbloc_ros.core.synchroniser import FrameSet, StampSynchroniser, SyncCounters
 from limbloc_ros.rig.watch import ConsistencyWatch
 from limbloc_ros.ros.backlog import Backlog
-from limbloc_ros.ros.health import Meter
+from limbloc_ros.ros.health import WINDOW_S, Meter
 from limbloc_ros.ros.messages import ERROR, OK, WARN, make_status
 
 #: Longer without a mask or a set is worth a warning.
 SILENT_S = 2.0
+#: A camera that is missing in a larger share of the last seconds' sets is named, with what is known of the cause.
+MISSING_SHARE = 0.2
+#: Stamps this much older or younger on arrival than the other cameras' are given as the cause, s.
+OFF_S = 0.03
 
 
 class CarvingReport:
@@ -43,6 +51,8 @@ class CarvingReport:
         self._watch: ConsistencyWatch | None = None
         self._compared: FrameSet[Pixels] | None = None
         self._suspect: tuple[str, str] | None = None
+        self._past: deque[tuple[float, SyncCounters]] = deque()
+        self._jumps, self._jumped_s = 0, -WINDOW_S
 
     def mask(self, camera: str, mask: Pixels, latency_s: float) -> None:
         """A usable mask came."""
@@ -71,10 +81,20 @@ class CarvingReport:
         """
         self._compare(rig)
         counters = synchroniser.counters if synchroniser else SyncCounters()
+        self._look_back(counters)
         return [
             self._hull(synchroniser, counters, backlog, problems),
             *(self._camera(c, counters, problems) for c in self._topics),
         ]
+
+    def _look_back(self, counters: SyncCounters) -> None:
+        """Keep what was counted some seconds ago."""
+        now = time.monotonic()
+        self._past.append((now, copy.deepcopy(counters)))
+        while now - self._past[0][0] > WINDOW_S:
+            self._past.popleft()
+        if counters.resets != self._jumps:
+            self._jumps, self._jumped_s = counters.resets, now
 
     def _compare(self, rig: Rig | None) -> None:
         """Find out whether a camera has been bumped; a hull that vanished because of one is looked at too."""
@@ -99,6 +119,11 @@ class CarvingReport:
             message = f"no person: {self._outcome.reason}"
         elif self._outcome is not None:
             voxels, used = self._outcome.inside_count, self._outcome.cameras
+        if time.monotonic() - self._jumped_s < WINDOW_S:
+            level, message = (
+                WARN,
+                "the stamps jumped back in time: started anew (a looped recording, a clock that was set?)",
+            )
         if backlog.behind:
             level, message = WARN, backlog.behind
         if synchroniser is None:
@@ -131,6 +156,8 @@ class CarvingReport:
             level, message = ERROR, f"not in the rig: {problems[camera]}"
         elif meter.silence_s > SILENT_S:
             level, message = ERROR, self._why_silent(camera, meter.silence_s)
+        elif lost := self._why_lost(camera, counters):
+            level, message = WARN, lost
         elif camera in rejected:
             level, message = WARN, f"not used: {rejected[camera]}"
         elif self._suspect is not None and self._suspect[0] == camera:
@@ -145,6 +172,31 @@ class CarvingReport:
             "duplicate": counters.duplicate.get(camera, 0),
         }
         return make_status(f"{self._node.get_name()}: camera {camera}", level, message, values, camera)
+
+    def _why_lost(self, camera: str, counters: SyncCounters) -> str:
+        """Why the camera's masks, which come, are not in the sets of the last seconds; empty when they are."""
+        before = self._past[0][1]
+        sets = sum(getattr(counters, kind) - getattr(before, kind) for kind in ("complete", "incomplete"))
+        missing = counters.missing.get(camera, 0) - before.missing.get(camera, 0)
+        if sets < 3 or missing <= MISSING_SHARE * sets:
+            return ""
+        said = f"missing in {min(100.0 * missing / sets, 100.0):.0f} % of the sets of the last seconds"
+        if counters.duplicate[camera] - before.duplicate.get(camera, 0) > MISSING_SHARE * sets:
+            return f"{said}: it sends the same stamps again and again"
+        own, others = self._masks[camera], [m for c, m in self._masks.items() if c != camera and m.count]
+        older_s = (own.latency_ms - statistics.median(m.latency_ms for m in others)) / 1e3 if others else 0.0
+        if abs(older_s) > OFF_S:
+            how = "older" if older_s > 0 else "younger"
+            return (
+                f"{said}: on arrival its stamps are {1e3 * abs(older_s):.0f} ms {how} than the other cameras': it is "
+                f"{'late, or ' if older_s > 0 else ''}its clock is off"
+            )
+        rate = statistics.median(m.rate_hz for m in others) if others else 0.0
+        if own.rate_hz < (1 - MISSING_SHARE) * rate:
+            return f"{said}: {own.rate_hz:.1f} masks a second, the other cameras {rate:.1f}"
+        if counters.late[camera] - before.late.get(camera, 0) > MISSING_SHARE * sets:
+            return f"{said}: its masks come out of order, or when their set has left"
+        return f"{said}: its stamps are not those of the other cameras"
 
     def _why_silent(self, camera: str, silence_s: float) -> str:
         topic = self._topics[camera]
