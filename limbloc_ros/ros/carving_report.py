@@ -52,6 +52,7 @@ class CarvingReport:
         self._compared: FrameSet[Pixels] | None = None
         self._suspect: tuple[str, str] | None = None
         self._past: deque[tuple[float, SyncCounters]] = deque()
+        self._missing: deque[tuple[float, tuple[str, ...]]] = deque()
         self._jumps, self._jumped_s = 0, -WINDOW_S
 
     def mask(self, camera: str, mask: Pixels, latency_s: float) -> None:
@@ -63,6 +64,7 @@ class CarvingReport:
         """A set was carved and its hull published."""
         self._last, self._outcome, self._carve_ms = frames, outcome, carve_ms
         self._sets.tick(latency_s)
+        self._missing.append((time.monotonic(), frames.missing))
 
     def statuses(
         self,
@@ -93,6 +95,8 @@ class CarvingReport:
         self._past.append((now, copy.deepcopy(counters)))
         while now - self._past[0][0] > WINDOW_S:
             self._past.popleft()
+        while self._missing and now - self._missing[0][0] > WINDOW_S:
+            self._missing.popleft()
         if counters.resets != self._jumps:
             self._jumps, self._jumped_s = counters.resets, now
 
@@ -175,9 +179,8 @@ class CarvingReport:
 
     def _why_lost(self, camera: str, counters: SyncCounters) -> str:
         """Why the camera's masks, which come, are not in the sets of the last seconds; empty when they are."""
-        before = self._past[0][1]
-        sets = sum(getattr(counters, kind) - getattr(before, kind) for kind in ("complete", "incomplete"))
-        missing = counters.missing.get(camera, 0) - before.missing.get(camera, 0)
+        before, sets = self._past[0][1], len(self._missing)
+        missing = sum(camera in lost for _, lost in self._missing)
         if sets < 3 or missing <= MISSING_SHARE * sets:
             return ""
         said = f"missing in {min(100.0 * missing / sets, 100.0):.0f} % of the sets of the last seconds"
