@@ -34,6 +34,9 @@ SILENT_S = 2.0
 #: A camera that sends the very same picture for this long (by its stamps) is frozen: a live sensor has noise.
 FROZEN_S = 1.0
 
+#: With less of the background's light than this, or more than its inverse, masks lose parts of low contrast.
+DIM = 0.5
+
 #: The background follows the light; so often what is kept of it does too.
 SAVE_PERIOD_S = 60.0
 
@@ -210,6 +213,12 @@ class SegmentationNode(Node):
                 level, message = WARN, f"learning the background ({progress}): keep the room empty"
         if level == OK and self.frozen_s > FROZEN_S:
             level, message = ERROR, f"the camera has sent the very same picture for {self.frozen_s:.0f} s: it is frozen"
+        if level == OK and self.last is not None and not DIM < min(self.last.gain) <= max(self.last.gain) < 1 / DIM:
+            level = WARN
+            message = (
+                f"the light is {100 * min(self.last.gain):.0f} % of the background's: parts of people may be missed; "
+                f"light the room as before, or empty it and call {self.get_name()}/recapture_background"
+            )
         if level == OK and time.monotonic() - self.relit_s < WINDOW_S:
             level, message = WARN, "the light was switched: the background was brought to the new light"
         if level == OK and self.model.unrest > UNREST:
