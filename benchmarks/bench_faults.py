@@ -65,7 +65,6 @@ def run(live: Live, scenario: Scenario, verbose: bool = False) -> Outcome:
     restarts, before = sum(live.graph.restarts.values()), footprint(live.graph.pids)
     bad = {name for name, (level, _) in live.levels.items() if level}
     first_said, first_answer, began = len(live.said), len(live.answers), time.monotonic()
-    filmed = len(live.cameras.truth)
     scenario.begin(live)
     live.spin(scenario.lasts_s)
     counted_from = began
@@ -77,7 +76,7 @@ def run(live: Live, scenario: Scenario, verbose: bool = False) -> Outcome:
     right_at = steady(live.answers[fresh:])
     until = time.monotonic() if right_at is None else right_at
     answers = [a for a in live.answers[first_answer:] if a.at_s < until]
-    filmed = len(live.cameras.truth) - filmed
+    filmed = sum(began <= at_s < until for at_s in live.cameras.filmed_s)
     rest = len(live.answers)
     live.spin(AFTER_S)
     said = [s for s in live.said[first_said:] if s.level and s.at_s <= until + 1.0]
@@ -172,15 +171,15 @@ def run_all(scenarios: list[Scenario], verbose: bool) -> list[Outcome]:
                 outcome = run(live, scenario, verbose)
                 outcomes.append(outcome)
                 print(f"{scenario.name}: {outcome}", flush=True)
-                if scenario.end is None and scenario.lasts_s > 3.0 and outcome.right_s is not None:
-                    scenario_stays = scenario.name.startswith("lights")
-                    if scenario_stays:
-                        break
                 if not live.until_right(15.0):
                     print(f"after {scenario.name}: not right, a new graph", flush=True)
                     break
             end = footprint(live.graph.pids)
-            print(f"graph: {start} -> {end}", flush=True)
+            print(
+                f"graph: {start.rss_mb} -> {end.rss_mb} MB, {start.threads} -> {end.threads} threads, "
+                f"{start.files} -> {end.files} files, {len(start.segments)} -> {len(end.segments)} shared segments",
+                flush=True,
+            )
             for line in live.lines:
                 if "Traceback" in line or "terminate called" in line or "died" in line:
                     print("   ", line)

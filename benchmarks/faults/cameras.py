@@ -48,6 +48,7 @@ class Cameras:
         tampers: the fault of a camera, by name.
         shift_s: added to the stamps (a clock that was set, a bag that is looped).
         truth: what was there, by stamp: joints [25, 3] or None.
+        filmed_s: when each instant was filmed, monotonic clock.
         filming: whether they send anything.
     """
 
@@ -57,8 +58,8 @@ class Cameras:
         self.tampers: dict[str, Tamper] = {}
         self.shift_s = 0.0
         self.truth: dict[int, NDArray[np.float64] | None] = {}
+        self.filmed_s: list[float] = []
         self.filming = True
-        self.extra_load: Callable[[], None] | None = None
         self._publishers = {
             name: node.create_publisher(Image, f"{namespace}{topics.image(name)}", topics.STREAM_QOS)
             for name in stage.rig.names
@@ -89,6 +90,7 @@ class Cameras:
         images, joints = self.stage.shoot(self.period_s, wall_ns / NANOSECONDS)
         stamp_ns = wall_ns + round(self.shift_s * NANOSECONDS)
         self.truth[stamp_ns] = joints
+        self.filmed_s.append(now)
         if not self.filming:
             return
         for name, pixels in images.items():

@@ -43,6 +43,7 @@ class Scenario:
 
 
 VICTIM = "cam2"
+HALF = ("cam0", "cam2", "cam4", "cam6")
 
 
 def tamper(make: Callable[[], Tamper], *cameras: str) -> Act:
@@ -156,7 +157,7 @@ def noisy() -> Tamper:
 
 def lamp(image: Image) -> Image:
     """A second lamp: brighter, warmer, and more so on one side."""
-    height, width = image.shape[:2]
+    width = image.shape[1]
     across = np.linspace(1.25, 1.6, width, dtype=np.float32)[None, :, None]
     colour = np.array([0.92, 1.0, 1.08], dtype=np.float32)
     return np.asarray(np.clip(image * across * colour, 0, 255).astype(np.uint8))
@@ -209,6 +210,16 @@ def no_chair(live: Live) -> None:
     """The chair is taken away; the person is there."""
     live.stage.chair = None
     live.stage.enter()
+
+
+def leave(live: Live) -> None:
+    """The person goes."""
+    live.stage.leave()
+
+
+def come_in(live: Live) -> None:
+    """And comes in again."""
+    live.stage.come_in()
 
 
 def pose_as(posture: Callable[..., object] | None, box: bool = False) -> Act:
@@ -281,7 +292,7 @@ def idle(live: Live) -> None:
 SCENARIOS = (
     Scenario("none", "nothing (what the figures below compare with)", idle, idle, 15.0),
     Scenario("camera_stops", "a camera stops and returns", tamper(nothing, VICTIM), mend),
-    Scenario("four_stop", "four of eight cameras stop and return", tamper(nothing, "cam0", "cam2", "cam4", "cam6"), mend),
+    Scenario("four_stop", "four of eight cameras stop and return", tamper(nothing, *HALF), mend),
     Scenario("freeze_stamp", "a camera freezes, same stamp", tamper(frozen(True), VICTIM), mend),
     Scenario("freeze_image", "a camera freezes, new stamps", tamper(frozen(False), VICTIM), mend, 10.0),
     Scenario("half_rate", "a camera at half the rate", tamper(every_second, VICTIM), mend),
@@ -302,7 +313,7 @@ SCENARIOS = (
     Scenario("lights_off", "the light switched off, and on again", light(dusk), mend, 12.0, 60.0),
     Scenario("chair", "a chair moved in beside the person", chair, no_chair, 12.0),
     Scenario("chair_alone", "the person goes, a chair stays", chair_alone, no_chair, 12.0),
-    Scenario("leaves", "the person leaves, the room is empty, he returns", lambda live: live.stage.leave(), lambda live: live.stage.come_in(), 20.0),
+    Scenario("leaves", "the person leaves, the room is empty, he returns", leave, come_in, 20.0),
     Scenario("half_out", "half out of the carve volume", pose_as(at(1.45, 0.2)), pose_as(None), 8.0),
     Scenario("lies", "lies on the floor, gets up", pose_as(lying), pose_as(None), 8.0),
     Scenario("box", "carries a box, puts it away", pose_as(None, True), pose_as(None), 8.0),

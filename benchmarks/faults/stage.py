@@ -30,7 +30,7 @@ _SIDES = np.array(
 
 @dataclasses.dataclass(frozen=True)
 class Prop:
-    """A thing of boxes: vertices [V, 3] m in world axes, triangles [F, 3], colour bgr as one of the person's clothes."""
+    """A thing of boxes: vertices [V, 3] m in world axes, triangles [F, 3], coloured as one of the person's clothes."""
 
     vertices: Array
     faces: NDArray[np.int32]
@@ -169,7 +169,12 @@ class Stage(SimulatedRoom):
             return
         vertices, faces, garments, tones = [], [], [], []
         if posed is not None:
-            vertices, faces, garments, tones = [posed.vertices], [self.body.faces], [self.body.garments], [self._body_tone]
+            vertices, faces, garments, tones = (
+                [posed.vertices],
+                [self.body.faces],
+                [self.body.garments],
+                [self._body_tone],
+            )
         for thing in things:
             faces.append(thing.faces + sum(map(len, vertices)))
             vertices.append(thing.vertices)
