@@ -9,6 +9,7 @@ the parser.
 from __future__ import annotations
 
 import io
+import math
 import random
 import re
 import struct
@@ -75,6 +76,13 @@ class Draw:
         if kind == 1:
             return float(struct.unpack("<d", self.take(8))[0])
         return (self.below(65536) - 32768) / (1.0, 100.0)[kind - 2]
+
+    def near(self, usual: float) -> float:
+        """Mostly a number near a usual one, seldom any finite one."""
+        if self.below(16):
+            return usual * (0.5 + self.below(1000) / 1000)
+        found = self.number()
+        return found if math.isfinite(found) else usual
 
     def text(self) -> str:
         """A short or odd text without a zero byte."""
@@ -170,8 +178,8 @@ def mutate_npz(data: bytes, most: int, rng: random.Random) -> bytes:
     with zipfile.ZipFile(out, "w", rng.choice((zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED))) as archive_out:
         for name, array in arrays.items():
             member = io.BytesIO()
-            if array.dtype.kind == "V" and array.dtype.names is None:
-                array = array.view(np.uint8)
+            if array.dtype.kind == "V":
+                array = np.frombuffer(array.tobytes(), np.uint8)
             np.save(member, array, allow_pickle=False)
             raw = member.getvalue()
             if name in lies:

@@ -233,14 +233,14 @@ def _drawn_rig(draw: Draw) -> Rig:
     for _ in range(1 + draw.below(3)):
         model = draw.choice(tuple(DISTORTION_COEFFICIENTS))
         count = draw.choice(DISTORTION_COEFFICIENTS[model])
-        K = np.array([[draw.number(), 0, draw.number()], [0, draw.number(), draw.number()], [0, 0, 1.0]])
-        place = np.array([draw.number(), draw.number(), draw.number()])
+        K = np.array([[draw.near(500), 0, draw.near(320)], [0, draw.near(500), draw.near(240)], [0, 0, 1.0]])
+        place = np.array([draw.near(2), draw.near(1), draw.near(2)])
         T = looking_at(place, np.array([0, 0.1, 1.0])) if draw.below(4) else np.diag([1.0, -1, -1, 1])
-        width, height = draw.integer(2**31), draw.integer(2**31)
+        width, height = int(draw.near(640) % 2**31), int(draw.near(480) % 2**31)
         name = f"cam{len(cameras)}" if draw.below(2) else draw.text()
-        lens = np.array([draw.number() for _ in range(count)])
+        lens = np.array([draw.near(0.01) for _ in range(count)])
         cameras.append(Camera(name, width, height, K, T, lens, model))
-    return Rig(tuple(cameras), np.array([draw.number() for _ in range(3)]), np.array([draw.number() for _ in range(3)]))
+    return Rig(tuple(cameras), np.full(3, draw.near(-1)), np.full(3, draw.near(2)))
 
 
 @target("export", lambda: [bytes(range(64)) * 4, b"\1\0" * 200, bytes(400)], most=600)

@@ -19,6 +19,9 @@ MAX_PIXELS = 64_000_000
 #: No room needs more; squares and products of larger numbers overflow further on.
 _LARGEST = {"K": 1e7, "T_world_camera": 1e4, "distortion": 1e7}
 
+#: OpenCV fills polygons row by row, also far outside the image.
+_FARTHEST_PX = 1e5
+
 DISTORTION_COEFFICIENTS = {"none": (0,), "radtan": (4, 5), "rational": (8, 12, 14), "fisheye": (4,)}
 
 
@@ -61,7 +64,9 @@ class Camera:
             value.setflags(write=False)
             object.__setattr__(self, name, value)
         # It becomes part of topics and file names.
-        if not self.name.isprintable() or any(part in ("", ".", "..") for part in self.name.split("/")):
+        if not (self.name.isprintable() and len(self.name) <= 100) or any(
+            part in ("", ".", "..") for part in self.name.split("/")
+        ):
             raise RigError(f"expected a camera's name such as cam0, got {self.name!r:.80}")
         if self.width < 1 or self.height < 1:
             raise RigError(f"camera {self.name}: image size must be positive, got {self.width}x{self.height}")
@@ -88,9 +93,11 @@ class Camera:
             )
         polygons = tuple(np.array(polygon, dtype=np.float64) for polygon in self.ignore)
         for polygon in polygons:
-            if polygon.ndim != 2 or polygon.shape[1] != 2 or len(polygon) < 3 or not np.isfinite(polygon).all():
+            shaped = polygon.ndim == 2 and polygon.shape[1] == 2 and len(polygon) >= 3
+            if not shaped or not (np.abs(polygon) <= _FARTHEST_PX).all():
                 raise RigError(
-                    f"camera {self.name}: ignore takes polygons of three or more (x, y) in px, got {polygon.tolist()}"
+                    f"camera {self.name}: ignore takes polygons of three or more (x, y) in px, none farther than "
+                    f"{_FARTHEST_PX:g}, got {str(polygon.tolist()):.200}"
                 )
             polygon.setflags(write=False)
         object.__setattr__(self, "ignore", polygons)

@@ -163,6 +163,8 @@ def _check_size(values: Any, what: str) -> None:
 
 def required(entry: Mapping[str, Any], key: str, at: str) -> Any:
     """The value of `key`; raises RigError that lists the keys there are."""
+    if not isinstance(entry, Mapping):
+        raise RigError(f"{at}: expected key {key} and others, got {kind(entry)}")
     if key not in entry:
         raise RigError(f"{at}: key {key} is missing; it has {', '.join(map(str, entry)) or 'no keys'}")
     return entry[key]

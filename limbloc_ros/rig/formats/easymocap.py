@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -110,6 +111,10 @@ class _Storage:
 
 def write(rig: Rig, path: Path) -> list[str]:
     """Write both files into the folder `path`."""
+    if wrong := [camera.name for camera in rig.cameras if not re.fullmatch(r"[\w -]+", camera.name, re.ASCII)]:
+        raise RigError(
+            f"camera {', '.join(wrong)}: EasyMocap's files hold only names of letters, digits, `-`, `_` and spaces"
+        )
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
