@@ -253,7 +253,7 @@ def test_tf_and_the_list_of_bodies_where_they_exist(
     monkeypatch.setitem(sys.modules, "tf2_ros", tf2)
     node = graph.add(PoseNode)
     tracked: list[IdsList] = []
-    node.body._ids_list, node.body._tracked = IdsList, types.SimpleNamespace(publish=tracked.append)
+    node.bodies._ids_list, node.bodies._tracked = IdsList, types.SimpleNamespace(publish=tracked.append)
     node.estimator.estimate = lambda _: offline
     descriptions = graph.collect(String, "humans/bodies/p1/urdf", topics.LATCHED_QOS)
     carvings = Carvings(graph)

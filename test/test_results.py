@@ -153,7 +153,7 @@ def test_checkpoint_of_another_run_or_a_damaged_one_is_not_used(tmp_path):
     for frame in make_frames(FLUSH_FRAMES + 1):
         first.add(frame)
     first.flush()
-    chunks = sorted((tmp_path / ".partial" / "key").iterdir())
+    chunks = sorted((tmp_path / ".partial" / "key").glob("*.npz"))
     assert len(chunks) == 2
     chunks[1].write_bytes(b"half a file")
     assert len(Checkpoint(tmp_path / ".partial", "key").done) == FLUSH_FRAMES

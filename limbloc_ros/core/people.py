@@ -35,7 +35,7 @@ from scipy.spatial import cKDTree
 
 from limbloc_ros.core import figure
 from limbloc_ros.core.config import FitConfig
-from limbloc_ros.core.errors import NoPerson
+from limbloc_ros.core.errors import InputError, NoPerson
 from limbloc_ros.core.figure import FigureState
 from limbloc_ros.core.hull import NOBODY, Hull, components, largest_component
 from limbloc_ros.core.joint_angles import ContinuousAngles
@@ -229,6 +229,8 @@ class People:
 
     def __init__(self, config: FitConfig, consecutive: bool = True) -> None:
         self.config = config
+        #: Fits whoever comes into an empty room.
+        self.estimator = PoseEstimator(config)
         self._consecutive = consecutive
         self._tracks: list[_Track] = []
         #: Taken for a person without proof while there is nobody else.
@@ -242,6 +244,7 @@ class People:
     def reset(self) -> None:
         """Forget everybody (a new recording, a jump back in time)."""
         self._tracks, self._alone = [], None
+        self.estimator.reset()
 
     def look(self, hull: Hull) -> Sight:
         """What there is to see in a carved hull, for `follow`."""
@@ -329,8 +332,8 @@ class People:
         return taken
 
     def _begin(self, part: Part, stamp_ns: int) -> _Track:
-        made = (PoseEstimator(self.config), ContinuousAngles())
-        return _Track(*made, stamp_ns, stamp_ns, part.points, part.centre, part.volume_m3)
+        estimator = PoseEstimator(self.config) if self._tracks else self.estimator
+        return _Track(estimator, ContinuousAngles(), stamp_ns, stamp_ns, part.points, part.centre, part.volume_m3)
 
     def _assign(self, parts: Sequence[Part], stamp_ns: int) -> list[tuple[_Track, int]]:
         """Which track has which part; several may have the same."""
@@ -378,7 +381,11 @@ class People:
         present = [track for track in self._tracks if track not in gone]
         newcomers = [track for track in present if not track.number and track.score == PERSON]
         others = newcomers or [track for track in present if track.number]
-        self._tracks = [track for track in self._tracks if track not in gone or (track is last and not others)]
+        kept = [track for track in self._tracks if track not in gone or (track is last and not others)]
+        for track in self._tracks:
+            if track not in kept:
+                track.estimator.reset()
+        self._tracks = kept
         for track in newcomers:
             used = {other.number for other in self._tracks}
             if self._alone in self._tracks and self._alone is not track and self._alone.score > 0:
@@ -400,9 +407,16 @@ class People:
         }
 
     def resume(self, snapshot: Mapping[str, Any]) -> None:
-        """Go on as if the frames up to a snapshot had just been followed."""
-        self._tracks = [_track(values, PoseEstimator(self.config)) for values in snapshot["tracks"]]
-        self._alone = None if snapshot["alone"] is None else self._tracks[snapshot["alone"]]
+        """Go on as if the frames up to a snapshot had just been followed.
+
+        Raises:
+            InputError: it is no snapshot.
+        """
+        try:
+            self._tracks = [_track(values, PoseEstimator(self.config)) for values in snapshot["tracks"]]
+            self._alone = None if snapshot["alone"] is None else self._tracks[snapshot["alone"]]
+        except (KeyError, TypeError, ValueError, IndexError) as error:
+            raise InputError(f"what is kept of the people of an unfinished run is damaged ({error!r})") from None
 
 
 def _distance(track: _Track, stamp_ns: int) -> Callable[[Array], Array]:

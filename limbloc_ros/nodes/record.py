@@ -29,7 +29,7 @@ DISCOVERY_PERIOD_S = 0.5
 DEFAULT_TOPICS = (
     r".*/camera_info",
     r".*/mask/compressed",
-    r".*/(true_)?joints",
+    r".*/(true_)?joints(_\d+)?",
     r".*/joint_angles",
     r".*/humans/bodies/[^/]+/(joint_states|urdf)",
     r"/diagnostics",

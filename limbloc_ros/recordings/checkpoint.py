@@ -7,11 +7,13 @@ import hashlib
 import json
 import shutil
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from limbloc_ros.core.errors import InputError, OutputError
-from limbloc_ros.recordings.results import FrameResult, load_frames, save_frames
+from limbloc_ros.recordings.results import FrameResult, load_frames, replace_file, save_frames, with_others
+from limbloc_ros.rig.plain_values import json_values
 
 #: Results are written down after this many frames or seconds, whichever comes first.
 FLUSH_FRAMES, FLUSH_S = 50, 10.0
@@ -33,6 +35,7 @@ class Checkpoint:
 
     Attributes:
         done: the frames that an interrupted run had finished.
+        state: what the next frame depends on, as it was given with the last of them; None without any.
     """
 
     def __init__(self, folder: Path | None, key: str) -> None:
@@ -41,6 +44,7 @@ class Checkpoint:
         self.discarded = bool(others)
         for child in others:
             shutil.rmtree(child)
+        self.state: dict[str, Any] | None = None
         self.done: list[FrameResult] = self._load()
         self._count = len(self.done)
         self._waiting: list[FrameResult] = []
@@ -50,16 +54,21 @@ class Checkpoint:
         frames: list[FrameResult] = []
         while self._folder is not None and (path := _chunk(self._folder, len(frames))).is_file():
             try:
-                frames += load_frames(path)
+                chunk = load_frames(path)
+                for other in sorted(self._folder.glob(f"{path.stem}_p*.npz")):
+                    chunk = with_others(chunk, load_frames(other))
+                self.state = _read_state(path.with_suffix(".json"))
+                frames += chunk
             except InputError:
                 path.unlink()  # damaged since it was renamed into place whole: work it out once more
         return frames
 
-    def add(self, frame: FrameResult) -> None:
-        """Keep the next frame."""
+    def add(self, frame: FrameResult, state: Callable[[], dict[str, Any]] = dict) -> None:
+        """Keep the next frame; `state` gives plain values that the frame after it depends on."""
         if self._folder is None:
             return
         self._waiting.append(frame)
+        self._state = state()
         if len(self._waiting) >= FLUSH_FRAMES or time.monotonic() - self._flushed_s >= FLUSH_S:
             self.flush()
 
@@ -70,7 +79,12 @@ class Checkpoint:
                 self._folder.mkdir(parents=True, exist_ok=True)
             except OSError as error:
                 raise OutputError(f"{self._folder} cannot be made: {error.strerror}; choose another --out") from None
-            save_frames(self._waiting, _chunk(self._folder, self._count))
+            path = _chunk(self._folder, self._count)
+            for number in {body.number for frame in self._waiting for body in frame.others}:
+                save_frames([frame.of(number) for frame in self._waiting], path.with_name(f"{path.stem}_p{number}.npz"))
+            text = json.dumps(self._state)
+            replace_file(path.with_suffix(".json"), lambda file: file.write(text.encode()))
+            save_frames(self._waiting, path)  # last: with it the others count
             self._count += len(self._waiting)
             self._waiting = []
         self._flushed_s = time.monotonic()
@@ -79,3 +93,14 @@ class Checkpoint:
 def _chunk(folder: Path, first: int) -> Path:
     """The file that begins with frame number `first`."""
     return folder / f"from_{first:08d}.npz"
+
+
+def _read_state(path: Path) -> dict[str, Any]:
+    """Raises InputError when it is missing or damaged."""
+    try:
+        state = json_values(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path} cannot be read: {error}") from None
+    if not isinstance(state, dict):
+        raise InputError(f"{path}: expected a mapping")
+    return state

@@ -4,12 +4,17 @@
 Frames are independent (paper section 4), so carving and fitting go to a pool of single-threaded processes, while the
 masks come from one sequential stream. Any number of jobs gives the same result. Only with `temporal` each frame starts
 from the one before, and one process does them in order.
+
+Who is who (`core/people`) goes on from frame to frame in any case. It is cheap, so this process does it with what the
+others have found: the parts of each hull and the pose of each part alone. Only where people touch it needs the hull
+itself, carves it once more, and fits the pieces.
 """
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import multiprocessing
 import os
 import shutil
@@ -17,7 +22,7 @@ import signal
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
@@ -32,8 +37,10 @@ from limbloc_ros.core import background
 from limbloc_ros.core.camera import Rig
 from limbloc_ros.core.config import BackgroundConfig, FitConfig, HullConfig, SyncConfig
 from limbloc_ros.core.errors import InputError, Interrupted, NoPerson
-from limbloc_ros.core.joint_angles import ContinuousAngles
+from limbloc_ros.core.hull import Hull
+from limbloc_ros.core.people import Body, Part, People, Sight, candidates
 from limbloc_ros.core.pipeline import Carver, PoseEstimator
+from limbloc_ros.core.pose import Pose
 from limbloc_ros.recordings.cases import pack_mask, unpack_mask
 from limbloc_ros.recordings.checkpoint import Checkpoint, fingerprint
 from limbloc_ros.recordings.kept_frames import KeptFrames
@@ -102,19 +109,17 @@ def process(
     jobs = 1 if config.fit.temporal else min(jobs or usable_cores(), total or 10**6)
     frames = list(done)
     # Frames of a set that is no sequence have nothing to do with each other.
-    angles = ContinuousAngles() if source.about.get("consecutive", True) else None
-    if angles is not None:
-        for frame in done:
-            angles.resume(frame.outcome, frame.stamp_ns)
+    people = People(config.fit, consecutive=source.about.get("consecutive", True))
+    if checkpoint.state is not None:
+        people.resume(checkpoint.state)
     kept = kept if kept is not None else KeptFrames()
     progress(len(frames), total)
     told = 0
     try:
-        for frame in _fitted(source, config, jobs, _Part(leave_out, len(done)), kept):
-            if angles is not None:
-                frame = dataclasses.replace(frame, outcome=angles.follow(frame.outcome, frame.stamp_ns))
+        for seen in _seen(source, config, people.max_people, jobs, _Left(leave_out, len(done)), kept):
+            frame = _followed(people, seen)
             frames.append(frame)
-            checkpoint.add(frame)
+            checkpoint.add(frame, people.snapshot)
             progress(len(frames), total)
             for note in source.notes[told:]:  # at once: who is told only at the end has waited in vain
                 say(note)
@@ -177,7 +182,7 @@ def _how_to_go_on(done: int, total: int | None, kept: bool, config: OfflineConfi
 
 
 @dataclass(frozen=True)
-class _Part:
+class _Left:
     """Which frames are to be fitted: not the first `leave_out`, and of the others not the first `done`."""
 
     leave_out: int
@@ -194,59 +199,113 @@ class _Job:
     stage_ms: dict[str, float]
 
 
-class _Fitter:
-    """One frame at a time: masks -> hull -> pose."""
+@dataclass(frozen=True)
+class _Seen:
+    """What there is to see in one frame, or why there is nothing."""
 
-    def __init__(self, rig: Rig, config: OfflineConfig) -> None:
+    stamp_ns: int
+    sight: Sight | NoPerson
+    stage_ms: dict[str, float]
+
+
+@dataclass(frozen=True)
+class _Fitted:
+    """A frame on its way back from a worker: a `Sight` whose hulls stayed there."""
+
+    stamp_ns: int
+    parts: tuple[Part, ...]
+    outcomes: tuple[Pose | NoPerson, ...]
+    reason: str
+    stage_ms: dict[str, float]
+
+
+class _Fitter:
+    """One frame at a time: masks -> hull -> poses."""
+
+    def __init__(self, rig: Rig, config: OfflineConfig, max_people: int) -> None:
         self._widths = {camera.name: camera.width for camera in rig.cameras}
         self._carver = Carver(rig, config.hull)
+        self._max_people = max_people
         self._estimator = PoseEstimator(config.fit)
 
-    def fit(self, job: _Job) -> FrameResult:
-        """The result of one frame; the same in whichever process it runs."""
+    def carve(self, job: _Job) -> Hull | NoPerson:
+        """The hull of one frame."""
         if job.reason:
-            return FrameResult(job.stamp_ns, NoPerson(job.reason), job.stage_ms)
+            return NoPerson(job.reason)
+        return self._carver.carve({name: unpack_mask(bits, self._widths[name]) for name, bits in job.packed.items()})
+
+    def look(self, job: _Job) -> _Seen:
+        """What there is to see in one frame; nothing is fitted yet."""
         start = time.process_time()
-        hull = self._carver.carve({name: unpack_mask(bits, self._widths[name]) for name, bits in job.packed.items()})
-        stage_ms = {**job.stage_ms, "hull": 1e3 * (time.process_time() - start)}
-        if isinstance(hull, NoPerson):
-            return FrameResult(job.stamp_ns, hull, stage_ms)
-        outcome = self._estimator.estimate(hull)
-        return FrameResult(job.stamp_ns, outcome, stage_ms)
+        hull = self.carve(job)
+        stage_ms = job.stage_ms if job.reason else {**job.stage_ms, "hull": 1e3 * (time.process_time() - start)}
+        return _Seen(job.stamp_ns, hull if isinstance(hull, NoPerson) else Sight.of(hull, self._max_people), stage_ms)
+
+    def fit(self, job: _Job) -> _Fitted:
+        """The pose of each part of one frame alone; the same in whichever process it runs."""
+        seen = self.look(job)
+        if isinstance(seen.sight, NoPerson):
+            return _Fitted(job.stamp_ns, (), (), seen.sight.reason, seen.stage_ms)
+        outcomes = tuple(self._estimator.estimate(hull) for hull in seen.sight.hulls())
+        return _Fitted(job.stamp_ns, seen.sight.parts, outcomes, "", seen.stage_ms)
+
+    def back(self, fitted: _Fitted, job: _Job) -> _Seen:
+        """What a worker's `fit` saw; its hulls are carved again when they are asked for."""
+
+        def hulls() -> Sequence[Hull]:
+            hull = self.carve(job)
+            assert isinstance(hull, Hull), "carving gives the same in every process"
+            return candidates(hull, self._max_people)
+
+        sight: Sight | NoPerson = Sight(fitted.parts, functools.cache(hulls), fitted.outcomes)
+        if fitted.reason:
+            sight = NoPerson(fitted.reason)
+        return _Seen(fitted.stamp_ns, sight, fitted.stage_ms)
 
 
-def _fitted(source: Source, config: OfflineConfig, jobs: int, part: _Part, kept: KeptFrames) -> Iterator[FrameResult]:
-    """Results in the order of the frames."""
-    work = _jobs(source, kept, part)
+def _followed(people: People, seen: _Seen) -> FrameResult:
+    """Who is who in a frame."""
+    bodies = people.follow(seen.sight, seen.stamp_ns)
+    first: Body = bodies[0]
+    return FrameResult(seen.stamp_ns, first.outcome, seen.stage_ms, first.number, bodies[1:])
+
+
+def _seen(
+    source: Source, config: OfflineConfig, max_people: int, jobs: int, left: _Left, kept: KeptFrames
+) -> Iterator[_Seen]:
+    """What there is to see, in the order of the frames; with several jobs also the poses of all parts."""
+    work = _jobs(source, kept, left)
+    fitter = _Fitter(source.rig, config, max_people)
     if jobs == 1:
         cv2.setNumThreads(1)
-        fitter = _Fitter(source.rig, config)
-        yield from map(fitter.fit, work)
+        yield from map(fitter.look, work)
         return
     # spawn: forked children would inherit the threads' locks of OpenCV and numba
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(jobs, context, _start_worker, (source.rig, config)) as pool:
-        waiting: deque[Future[FrameResult]] = deque()
+    with ProcessPoolExecutor(jobs, context, _start_worker, (source.rig, config, max_people)) as pool:
+        waiting: deque[tuple[Future[_Fitted], _Job]] = deque()
         try:
             for job in work:
                 with _interrupts_kept_from_children():
-                    waiting.append(pool.submit(_work, job))
+                    waiting.append((pool.submit(_work, job), job))
                 # enough in flight to keep all busy, few enough for a long recording to fit in memory
-                while len(waiting) > 2 * jobs + 2 or (waiting and waiting[0].done()):
-                    yield waiting.popleft().result()
+                while len(waiting) > 2 * jobs + 2 or (waiting and waiting[0][0].done()):
+                    future, done = waiting.popleft()
+                    yield fitter.back(future.result(), done)
             while waiting:
-                yield waiting.popleft().result()
+                future, done = waiting.popleft()
+                yield fitter.back(future.result(), done)
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
 
 
-def _jobs(source: Source, kept: KeptFrames, part: _Part) -> Iterator[_Job]:
+def _jobs(source: Source, kept: KeptFrames, left: _Left) -> Iterator[_Job]:
     """The frames to be fitted; those before are only looked at, because segmentation needs them."""
-    for number, frame in enumerate(source.mask_sets(), start=-part.leave_out):
+    for number, frame in enumerate(source.mask_sets(), start=-left.leave_out):
         if number < 0:
             continue
         kept.add(number, frame.masks, frame.images)
-        if number >= part.done:
+        if number >= left.done:
             packed = {name: pack_mask(mask) for name, mask in frame.masks.items()}
             yield _Job(frame.stamp_ns, packed, frame.reason, frame.stage_ms)
 
@@ -268,12 +327,12 @@ def _interrupts_kept_from_children() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _start_worker(rig: Rig, config: OfflineConfig) -> None:
+def _start_worker(rig: Rig, config: OfflineConfig, max_people: int) -> None:
     global _worker
     cv2.setNumThreads(1)
-    _worker = _Fitter(rig, config)
+    _worker = _Fitter(rig, config, max_people)
 
 
-def _work(job: _Job) -> FrameResult:
+def _work(job: _Job) -> _Fitted:
     assert _worker is not None, "the pool starts every worker with _start_worker"
     return _worker.fit(job)

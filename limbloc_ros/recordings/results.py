@@ -9,6 +9,10 @@
 | `run.json` | what was run on what, for people: input, rig, settings, counts |
 
 NaN where there is no pose; the reason stands in `run.npz`. Files appear complete or not at all.
+
+With several people all of that is about one of them, the one followed longest (`body` [F] in `joints.npz` tells whose
+each row is). Then `joints.npz` also has everybody: `people` [P] ids, `people_joints` [F, P, 25, 3], `people_sigma`
+[F, P, 25], `people_reliable` [F, P]; and `people/<id>/` holds the same four files for each person, as a run of its own.
 """
 
 from __future__ import annotations
@@ -20,7 +24,7 @@ import json
 import math
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import IO, Any
 
@@ -28,11 +32,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from limbloc_ros.core.errors import InputError, NoPerson, OutputError
+from limbloc_ros.core.people import Body
 from limbloc_ros.core.pose import JOINT_NAMES, Flesh, Pose
 from limbloc_ros.recordings.npz_file import read_npz
 from limbloc_ros.rig.plain_values import json_values
 
 Array = NDArray[np.float64]
+
+#: What became of a person in a frame in which only others are followed.
+NOT_THERE = NoPerson("this person is not in the room")
 
 
 @dataclass(frozen=True)
@@ -43,16 +51,29 @@ class FrameResult:
         stamp_ns: its acquisition stamp, ns.
         outcome: the pose, or why there is none.
         stage_ms: process time of the stages before the pose, ms.
+        number: whose outcome this is: 1 for p1; of several people the one followed longest.
+        others: everybody else who is followed.
     """
 
     stamp_ns: int
     outcome: Pose | NoPerson
     stage_ms: dict[str, float] = field(default_factory=dict)
+    number: int = 1
+    others: tuple[Body, ...] = ()
 
     @property
     def times(self) -> dict[str, float]:
-        """Process time of all stages, those of the pose included, ms."""
-        return {**self.stage_ms, **(self.outcome.stage_ms if isinstance(self.outcome, Pose) else {})}
+        """Process time of all stages, those of the pose included, ms; `others` is all of theirs."""
+        times = {**self.stage_ms, **(self.outcome.stage_ms if isinstance(self.outcome, Pose) else {})}
+        others = [ms for o in self.others if isinstance(o.outcome, Pose) for ms in o.outcome.stage_ms.values()]
+        return {**times, "others": sum(others)} if others else times
+
+    def of(self, number: int) -> FrameResult:
+        """The same frame as one person's."""
+        if number == self.number:
+            return FrameResult(self.stamp_ns, self.outcome, self.stage_ms, number)
+        found = [body.outcome for body in self.others if body.number == number]
+        return FrameResult(self.stamp_ns, found[0] if found else NOT_THERE, self.stage_ms, number)
 
 
 @dataclass(frozen=True)
@@ -102,6 +123,15 @@ class Run:
         return tuple(f.outcome.reason if isinstance(f.outcome, NoPerson) else "" for f in self.frames)
 
     @property
+    def numbers(self) -> tuple[int, ...]:
+        """The numbers of all people of the run: 1 for p1."""
+        return tuple(sorted({n for f in self.frames for n in (f.number, *(body.number for body in f.others))}))
+
+    def of(self, number: int) -> Run:
+        """The run of one person alone."""
+        return Run(tuple(frame.of(number) for frame in self.frames), {**self.about, "person": person_id(number)})
+
+    @property
     def angle_names(self) -> tuple[str, ...]:
         """The native joint angles, in the order in which the poses name them."""
         return _union(tuple(f.outcome.angles) for f in self.frames if isinstance(f.outcome, Pose))
@@ -126,6 +156,14 @@ class Run:
         """
         folder = Path(folder)
         make_folder(folder)
+        if self.numbers != (1,):
+            for number in self.numbers:
+                self.of(number).save_alone(folder / PEOPLE / person_id(number))
+        self.save_alone(folder)
+
+    def save_alone(self, folder: Path) -> None:
+        """Write the four files of the frames' own outcomes."""
+        make_folder(folder)
         self.save_joints(folder / "joints.npz")
         replace_file(folder / "joint_angles.csv", lambda file: file.write(self._angles_csv().encode()))
         save_frames(self.frames, folder / "run.npz")
@@ -149,6 +187,15 @@ class Run:
             "sigma": self.sigma,
             "reliable": self.reliable,
         }
+        if len(self.numbers) > 1:
+            alone = [self.of(number) for number in self.numbers]
+            arrays |= {
+                "body": np.array([frame.number for frame in self.frames]),
+                "people": np.array([person_id(number) for number in self.numbers]),
+                "people_joints": np.stack([run.joints for run in alone], axis=1),
+                "people_sigma": np.stack([run.sigma for run in alone], axis=1),
+                "people_reliable": np.stack([run.reliable for run in alone], axis=1),
+            }
         make_folder(Path(path).parent)
         replace_file(Path(path), lambda file: np.savez_compressed(file, **arrays))
 
@@ -173,7 +220,31 @@ class Run:
             raise InputError(
                 f"{folder} holds no finished run: expected run.npz in it; make one with `process INPUT --out {folder}`"
             )
-        return Run(load_frames(folder / "run.npz"), _read_about(folder / "run.json"))
+        frames = load_frames(folder / "run.npz")
+        for other in sorted((folder / PEOPLE).glob("p*/run.npz")):
+            frames = with_others(frames, load_frames(other))
+        return Run(frames, _read_about(folder / "run.json"))
+
+
+#: Folder of the single people's runs within a run's.
+PEOPLE = "people"
+
+
+def person_id(number: int) -> str:
+    """What a person is called in files and topics."""
+    return f"p{number}"
+
+
+def with_others(frames: Sequence[FrameResult], other: Sequence[FrameResult]) -> tuple[FrameResult, ...]:
+    """Frames of a run with what became of one more person in them."""
+    if [frame.stamp_ns for frame in frames] != [frame.stamp_ns for frame in other]:
+        raise InputError("the frames of single people do not belong to this run; run `process` again")
+    merged = []
+    for frame, more in zip(frames, other, strict=True):
+        if more.number != frame.number and more.outcome != NOT_THERE:
+            frame = replace(frame, others=(*frame.others, Body(more.number, more.outcome)))
+        merged.append(frame)
+    return tuple(merged)
 
 
 def save_frames(frames: Sequence[FrameResult], path: Path) -> None:
@@ -182,6 +253,7 @@ def save_frames(frames: Sequence[FrameResult], path: Path) -> None:
     stages = _union(tuple(f.stage_ms) for f in frames)
     arrays: dict[str, Any] = {
         "stamps_ns": np.array([f.stamp_ns for f in frames], dtype=np.int64),
+        "numbers": np.array([f.number for f in frames], dtype=np.int64),
         "found": np.array([isinstance(f.outcome, Pose) for f in frames], dtype=np.bool_),
         "reasons": np.array(
             [f.outcome.reason if isinstance(f.outcome, NoPerson) else "" for f in frames], dtype=np.str_
@@ -218,6 +290,8 @@ def save_frames(frames: Sequence[FrameResult], path: Path) -> None:
 def load_frames(path: Path) -> tuple[FrameResult, ...]:
     """Read what `save_frames` wrote; raises InputError when the file is damaged."""
     data = read_npz(path)
+    if "stamps_ns" in data:  # runs from before there were several people
+        data.setdefault("numbers", np.ones(data["stamps_ns"].shape, np.int64))
     try:
         _check_layout(data)
         return tuple(_frames(data))
@@ -227,8 +301,8 @@ def load_frames(path: Path) -> tuple[FrameResult, ...]:
 
 #: Arrays of `run.npz`: kind of dtype, and lengths by letter: F frames, P poses, the others as the figure has them.
 _LAYOUT = {
-    "stamps_ns": ("i", "F"), "found": ("b", "F"), "reasons": ("U", "F"), "stage_names": ("U", "T"),
-    "stage_ms": ("f", "FT"),
+    "stamps_ns": ("i", "F"), "numbers": ("i", "F"), "found": ("b", "F"), "reasons": ("U", "F"),
+    "stage_names": ("U", "T"), "stage_ms": ("f", "FT"),
 }  # fmt: skip
 _POSE_LAYOUT = {
     "bone_names": ("U", "B"), "angle_names": ("U", "A"), "size_names": ("U", "S"), "pose_stage_names": ("U", "U"),
@@ -280,7 +354,8 @@ def _frames(data: dict[str, NDArray[Any]]) -> list[FrameResult]:
         if found:
             outcome = _pose(data, row)
             row += 1
-        frames.append(FrameResult(int(data["stamps_ns"][i]), outcome, _times(stages, data["stage_ms"][i])))
+        times = _times(stages, data["stage_ms"][i])
+        frames.append(FrameResult(int(data["stamps_ns"][i]), outcome, times, int(data["numbers"][i])))
     return frames
 
 

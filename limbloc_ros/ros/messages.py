@@ -104,21 +104,30 @@ def message_to_angles(msg: JointState) -> dict[str, float]:
 # --- pictures for RViz ---
 
 
-def figure_to_markers(pose: Pose, header: Header) -> MarkerArray:
-    """Stick figure (lines and joints, own left blue, own right red) and flesh figure (grey when not reliable)."""
+def figure_to_markers(pose: Pose, header: Header, prefix: str = "") -> MarkerArray:
+    """Stick figure (lines and joints, own left blue, own right red) and flesh figure (grey when not reliable).
+
+    `prefix` stands before the namespaces: several people are told apart by it.
+    """
     bones = [pose.joint(name) for bone in STICK_BONES for name in bone]
-    stick = _marker(header, "stick", Marker.LINE_LIST, STICK_WIDTH_M, _STICK if pose.reliable else _DOUBTFUL)
+    stick = _marker(header, f"{prefix}stick", Marker.LINE_LIST, STICK_WIDTH_M, _STICK if pose.reliable else _DOUBTFUL)
     stick.points = _points(np.array(bones))
-    joints = _marker(header, "joints", Marker.SPHERE_LIST, JOINT_SIZE_M, _MIDDLE)
+    joints = _marker(header, f"{prefix}joints", Marker.SPHERE_LIST, JOINT_SIZE_M, _MIDDLE)
     joints.points = _points(pose.joints)
     joints.colors = [_LEFT if n.endswith("_L") else _RIGHT if n.endswith("_R") else _MIDDLE for n in JOINT]
-    flesh = _marker(header, "flesh", Marker.TRIANGLE_LIST, 1.0, _FLESH if pose.reliable else _DOUBTFUL)
+    flesh = _marker(header, f"{prefix}flesh", Marker.TRIANGLE_LIST, 1.0, _FLESH if pose.reliable else _DOUBTFUL)
     flesh.points = _points(
         np.concatenate(
             [vertices[faces].reshape(-1, 3) for vertices, faces in flesh_mesh(pose.flesh, FLESH_SUBDIVISIONS)]
         )
     )
     return MarkerArray(markers=[stick, joints, flesh])
+
+
+def no_figure(header: Header, prefix: str) -> MarkerArray:
+    """Take one of several figures away."""
+    names = ("stick", "joints", "flesh")
+    return MarkerArray(markers=[Marker(header=header, ns=prefix + name, action=Marker.DELETE) for name in names])
 
 
 def no_markers(header: Header) -> MarkerArray:

@@ -7,6 +7,9 @@ as everywhere in ROS.
 Each carved set gives exactly one message on `hull` (an empty cloud when nobody is there), and each hull exactly one on
 `joints` (an empty array when there is no posture to act on): whoever waits for a result always gets one.
 
+`joints` and `joint_angles` are of one person: of several the one who has been followed longest. Everybody has the same
+below `humans/bodies/<id>`.
+
 Images are subscribed best effort, which every camera driver offers; everything we publish is reliable, because a
 reliable publisher also serves best-effort subscribers, RViz asks for reliable, and best-effort messages of some 100 KB
 are lost by an untuned Fast DDS (docs/deployment.md). The queues hold what comes during a slow moment of the node behind
@@ -56,10 +59,15 @@ FRAMES_SKIPPED = "frames_skipped"  # std_msgs/Header: a camera's segmentation is
 HULL = "hull"  # sensor_msgs/PointCloud2, see cloud_messages.hull_to_cloud
 SURFACE = "surface"  # sensor_msgs/PointCloud2 with normals, curvature and geodesic distance, on demand
 JOINTS = "joints"  # geometry_msgs/PoseArray, 25 joints in the order of core.pose.JOINT_NAMES
-TRUE_JOINTS = "true_joints"  # the same of the simulated person
+TRUE_JOINTS = "true_joints"  # the same of the first simulated person
 MARKERS = "markers"  # visualization_msgs/MarkerArray, stick figure and flesh figure
 JOINT_ANGLES = "joint_angles"  # sensor_msgs/JointState, the full native set
 DIAGNOSTICS = "/diagnostics"  # diagnostic_msgs/DiagnosticArray
+
+
+def true_joints(person: int) -> str:
+    """geometry_msgs/PoseArray of each simulated person, from 1."""
+    return TRUE_JOINTS if person == 1 else f"{TRUE_JOINTS}_{person}"
 
 
 BODIES_TRACKED = "humans/bodies/tracked"  # hri_msgs/IdsList, where hri_msgs is installed
@@ -78,6 +86,16 @@ def body_urdf(body_id: str) -> str:
 def body_native_urdf(body_id: str) -> str:
     """std_msgs/String, latched: the URDF whose joints are those of JOINT_ANGLES."""
     return f"humans/bodies/{body_id}/native_urdf"
+
+
+def body_joints(body_id: str) -> str:
+    """geometry_msgs/PoseArray: JOINTS of this person."""
+    return f"humans/bodies/{body_id}/joints"
+
+
+def body_joint_angles(body_id: str) -> str:
+    """sensor_msgs/JointState: JOINT_ANGLES of this person."""
+    return f"humans/bodies/{body_id}/joint_angles"
 
 
 def body_frame(body_id: str) -> str:
