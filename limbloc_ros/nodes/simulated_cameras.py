@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A simulated room: camera images, CameraInfo and the person's true joints, as if camera drivers were running.
+"""A simulated room: camera images, CameraInfo and everybody's true joints, as if camera drivers were running.
 
 Stamps are whole multiples of the frame period, so that several processes, each with some of the cameras, deliver
 images of exactly the same instants; give them the same `start_s`.
@@ -19,6 +19,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from limbloc_ros.core.config import setting
+from limbloc_ros.core.errors import ConfigError
 from limbloc_ros.rig.rig_file import load_rig, save_rig
 from limbloc_ros.ros import node_main, topics
 from limbloc_ros.ros.health import Health, Meter
@@ -34,6 +35,7 @@ from limbloc_ros.ros.messages import (
 )
 from limbloc_ros.ros.parameters import NodeParameters
 from limbloc_ros.ros.transforms import TransformOutput
+from limbloc_ros.simulation.company import MOST, TOGETHER, chair, company
 from limbloc_ros.simulation.room import Image as Image8
 from limbloc_ros.simulation.room import SimulatedRoom, default_rig
 
@@ -66,6 +68,14 @@ class SimulationSettings:
         high=3600.0,
     )
     person: str = setting("man", "who moves", choices=("man", "woman", "child", "heavy"))
+    people: int = setting(1, "how many there are; the others are the other kinds of `person`", low=1, high=MOST)
+    together: str = setting(
+        "apart",
+        "what several people do: each at an own place, walking past each other, or meeting shoulder to shoulder",
+        choices=TOGETHER,
+    )
+    chair: tuple[float, ...] = setting((), "a chair stands there (x y) from chair_s on; empty: none", unit="m")
+    chair_s: float = setting(6.0, "when the chair is put there, after the start", unit="s", low=0.0, high=3600.0)
     motions: tuple[str, ...] = setting((), "names of motions in order, repeated for ever; empty: a varied sequence")
     empty_s: float = setting(2.0, "the room is empty this long at first", unit="s", low=0.0, high=3600.0)
     noise_sigma: float = setting(2.5, "sensor noise", unit="grey levels", low=0.0, high=25.0)
@@ -86,7 +96,19 @@ class SimulatedCamerasNode(Node):
         self.cameras = tuple(rig.camera(name) for name in s.cameras or rig.names)
         # one process tells the truth: the one with the rig's first camera
         self.tells_truth = self.cameras[0].name == rig.names[0]
-        self.room = SimulatedRoom(rig, s.person, s.seed, s.empty_s, s.motions or None, s.noise_sigma, s.light_drift)
+        if s.chair and len(s.chair) != 2:
+            raise ConfigError(f"parameter chair: expected two numbers x y in m, or none, got {list(s.chair)}")
+        self.room = SimulatedRoom(
+            rig,
+            s.person,
+            s.seed,
+            s.empty_s,
+            s.motions or None,
+            s.noise_sigma,
+            s.light_drift,
+            motions=company(s.people, s.together, s.seed, s.empty_s, s.person) if s.people > 1 else (),
+            things=[chair([(s.chair_s, s.chair[0], s.chair[1], 0.3)])] if s.chair else (),
+        )
         self.get_logger().info("painting the room")
         self.room.warm_up()
         self.raw = self._image_publishers(Image, topics.image, ("raw", "both"))
@@ -95,9 +117,11 @@ class SimulatedCamerasNode(Node):
             c.name: self.create_publisher(CameraInfo, topics.camera_info(c.name), topics.STREAM_QOS)
             for c in self.cameras
         }
-        self.truth = (
-            self.create_publisher(PoseArray, topics.TRUE_JOINTS, topics.STREAM_QOS) if self.tells_truth else None
-        )
+        self.truth = [
+            self.create_publisher(PoseArray, topics.true_joints(n), topics.STREAM_QOS)
+            for n in range(1, s.people + 1)
+            if self.tells_truth
+        ]
         # Only the stamps change; making the whole message anew costs more than sending it.
         self.info_messages = {
             c.name: camera_to_info(c, make_header(0, topics.optical_frame(c.name))) for c in self.cameras
@@ -173,8 +197,10 @@ class SimulatedCamerasNode(Node):
                 raw.publish(pixels_to_image(pixels, header))
             if jpeg is not None:
                 jpeg.publish(pixels_to_compressed(pixels, header, self.settings.jpeg_quality))
-        if self.truth is not None:
-            self.truth.publish(joints_to_message(self.room.joints(t), make_header(stamp, self.settings.world_frame)))
+        if self.truth:
+            header = make_header(stamp, self.settings.world_frame)
+            for publisher, joints in zip(self.truth, self.room.everybodys_joints(t), strict=True):
+                publisher.publish(joints_to_message(joints, header))
         self.meter.tick(self.health.latency_s(stamp))
 
     def describe(self) -> Sequence[DiagnosticStatus]:
