@@ -24,6 +24,7 @@ COMMANDS = {
     "report": "make pictures and a page of a finished run",
     "export": "write a finished run for other programs: CSV, TRC, C3D, BVH, glTF, PLY, video",
     "view": "look at a finished run in 3D, in a window",
+    "security": "write the SROS2 policy of a smart space",
 }
 
 EPILOG = """\

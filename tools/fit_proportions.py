@@ -139,7 +139,7 @@ def main() -> None:
     args = parser.parse_args()
     torch.set_num_threads(1)
     rng = np.random.default_rng(0)
-    pop, posed = np.load(args.population), np.load(args.posed)
+    pop, posed = (np.load(path, allow_pickle=False) for path in (args.population, args.posed))
     stature = pop["stature"].astype(float)
     names = [str(n) for n in pop["bone_names"]]
     heads = {n: pop["bone_heads"][:, i].astype(float) for i, n in enumerate(names)}

@@ -97,7 +97,7 @@ class Camera:
             if not shaped or not (np.abs(polygon) <= _FARTHEST_PX).all():
                 raise RigError(
                     f"camera {self.name}: ignore takes polygons of three or more (x, y) in px, none farther than "
-                    f"{_FARTHEST_PX:g}, got {str(polygon.tolist()):.200}"
+                    f"{_FARTHEST_PX:g}, got {polygon.tolist()!s:.200}"
                 )
             polygon.setflags(write=False)
         object.__setattr__(self, "ignore", polygons)

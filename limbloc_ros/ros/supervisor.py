@@ -25,6 +25,8 @@ from limbloc_ros.core.config import setting
 POLL_S = 0.1
 #: A process that has run this long starts with the short delay again when it dies.
 SETTLED_S = 30.0
+#: SROS2 enclaves of the processes lie below this path; see docs/how_to/security.md.
+ENCLAVES = "/limbloc"
 #: Exit code of `nodes.composed` when a node refused its parameters or input.
 REFUSED = 2
 
@@ -188,7 +190,8 @@ class Supervisor:
         arguments = [child.plan.description, "--parent", str(os.getpid())]
         child.process = subprocess.Popen(
             [sys.executable, "-m", "limbloc_ros.nodes.composed", *arguments],
-            env=self._environment,
+            # Names the process's keys, for graphs that run with ROS_SECURITY_ENABLE.
+            env={"ROS_SECURITY_ENCLAVE_OVERRIDE": f"{ENCLAVES}/{child.plan.name}", **self._environment},
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
