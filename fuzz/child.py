@@ -49,7 +49,7 @@ class Slowest:
         self.count += 1
         self.good += not check(self.name, data)
         self.seconds = max(self.seconds, time.process_time() - start)
-        if self.count % 500 == 0:
+        if self.count % 50 == 0:
             self.tell()
 
     def tell(self) -> None:

@@ -8,6 +8,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import sqlite3
 import struct
@@ -116,6 +117,7 @@ class SalvagedMcap:
 
     def _scan(self, file: io.BufferedReader) -> None:
         """Walk the top-level records until the data ends or the file breaks off."""
+        self._size = self.path.stat().st_size
         while True:
             head_at = file.tell()
             head = file.read(9)
@@ -130,7 +132,8 @@ class SalvagedMcap:
                 if not self._scan_chunk(file, head_at, size):
                     return
                 continue
-            body = file.read(size) if size < 2**31 else b""
+            # What a damaged length claims would be allocated before it is read.
+            body = file.read(size) if size <= self._size else b""
             if len(body) != size:
                 self.damage = f"{self.path.name} breaks off within the record at byte {head_at}"
                 return
@@ -154,7 +157,7 @@ class SalvagedMcap:
         compression = rest[:name_size].decode(errors="replace")
         (data_size,) = struct.unpack_from("<Q", rest, name_size)
         offset = file.tell()
-        data = file.read(min(data_size, size))
+        data = file.read(min(data_size, size, self._size))
         whole = len(data) == data_size
         if whole or compression == "":
             block = _Block(offset, len(data), compression, unpacked_size if whole else len(data), crc if whole else 0)
@@ -181,7 +184,11 @@ class SalvagedMcap:
             self._blocks.append(block)
 
     def _declare(self, opcode: int, body: bytes) -> None:
-        """Take note of a schema or channel record."""
+        """Take note of a schema or channel record; a damaged one is passed over, and with it its messages."""
+        with contextlib.suppress(struct.error):
+            self._read_declaration(opcode, body)
+
+    def _read_declaration(self, opcode: int, body: bytes) -> None:
         if opcode == SCHEMA:
             (key,) = struct.unpack_from("<H", body)
             self._schemas[key] = _string(body, 2)[0]
@@ -216,8 +223,11 @@ class SalvagedSqlite:
             columns = {row[1] for row in self._connection.execute("PRAGMA table_info(topics)")}
             qos = "offered_qos_profiles" if "offered_qos_profiles" in columns else "''"
             for key, name, kind, profiles in self._connection.execute(f"SELECT id, name, type, {qos} FROM topics"):
-                self._contents.topics[key] = SalvagedTopic(name, kind, profiles)
-        except sqlite3.Error as error:
+                if isinstance(name, str) and isinstance(kind, str):  # a column of a damaged database may hold anything
+                    self._contents.topics[key] = SalvagedTopic(
+                        name, kind, profiles if isinstance(profiles, str) else ""
+                    )
+        except (sqlite3.Error, UnicodeDecodeError) as error:
             raise InputError(
                 f"{path}: expected a rosbag2 sqlite3 database, but its list of topics cannot be read ({error}). "
                 "Record with storage mcap: it survives being cut"
@@ -244,7 +254,7 @@ class SalvagedSqlite:
         for stamp_ns, row in self._rows:
             if start_ns <= stamp_ns < stop_ns:
                 found = self._row("topic_id, data", row)
-                if found is not None and found[0] in self._contents.topics:
+                if found is not None and found[0] in self._contents.topics and isinstance(found[1], bytes):
                     name = self._contents.topics[found[0]].name
                     if name in names:
                         yield name, stamp_ns, found[1]
@@ -267,6 +277,8 @@ class SalvagedSqlite:
         """Whether the file is shorter than its header says."""
         with self.path.open("rb") as file:
             header = file.read(100)
+        if len(header) < 100:
+            return True
         page_bytes, pages = struct.unpack(">H", header[16:18])[0], struct.unpack(">I", header[28:32])[0]
         return bool(self.path.stat().st_size < pages * (65536 if page_bytes == 1 else page_bytes))
 
@@ -284,7 +296,8 @@ class SalvagedSqlite:
         except sqlite3.Error as error:
             self.damage = f"{self.path.name}: {error}"
             rows, row, misses = [], 0, 0
-            while misses < SQLITE_GIVE_UP:
+            # A row takes some bytes: no file has more rows than that.
+            while misses < min(SQLITE_GIVE_UP, self.path.stat().st_size // 16):
                 row += 1
                 # Joining the data with nothing reads all its pages: a row whose data is gone counts as unreadable.
                 found = self._row("id, topic_id, timestamp, length(CAST(data AS BLOB) || x'')", row)
@@ -294,8 +307,9 @@ class SalvagedSqlite:
             if self._is_cut():
                 del rows[-1:]  # sqlite reads pages behind the end as zeros, and may not notice in the last message
         for row, topic, stamp_ns, _ in rows:
-            self._contents.count(topic, stamp_ns)
-            self._rows.append((stamp_ns, row))
+            if isinstance(stamp_ns, int) and isinstance(row, int):
+                self._contents.count(topic, stamp_ns)
+                self._rows.append((stamp_ns, row))
         self._rows.sort()
 
 

@@ -37,7 +37,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from limbloc_ros.core.camera import DISTORTION_COEFFICIENTS, Camera, Rig
-from limbloc_ros.core.errors import RigError
+from limbloc_ros.core.errors import OutputError, RigError
+from limbloc_ros.core.files import write_text
 from limbloc_ros.rig.plain_values import kind, known_keys, numbers, parse, read_text, required
 from limbloc_ros.rig.volume import derive_volume
 
@@ -151,9 +152,9 @@ def save_rig(rig: Rig, path: str | Path) -> None:
             *(f"      - [{', '.join(_row(point) for point in polygon)}]" for polygon in camera.ignore),
         ]
     try:
-        Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise RigError(f"rig file {path} cannot be written: {error.strerror}") from None
+        write_text(Path(path), "\n".join(lines) + "\n")
+    except OutputError as error:
+        raise RigError(f"rig file {error}") from None
 
 
 def _our_camera(entry: Mapping[str, Any], at: str, folder: Path) -> Camera:

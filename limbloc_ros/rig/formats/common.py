@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from limbloc_ros.core.camera import Camera, Rig
-from limbloc_ros.core.errors import OutputError, RigError
+from limbloc_ros.core.errors import RigError
 from limbloc_ros.rig.plain_values import flattened, kind, numbers, required
 
 Array = NDArray[np.float64]
@@ -145,19 +145,6 @@ def five_coefficients(camera: Camera, what: str) -> Array:
     out = np.zeros(5)
     out[: camera.distortion.size] = camera.distortion
     return out
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a text file.
-
-    Raises:
-        OutputError: it cannot be written.
-    """
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise OutputError(f"{path} cannot be written: {error.strerror}") from None
 
 
 def row(values: Any) -> str:

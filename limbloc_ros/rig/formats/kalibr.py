@@ -15,6 +15,7 @@ import numpy as np
 
 from limbloc_ros.core.camera import Rig
 from limbloc_ros.core.errors import RigError
+from limbloc_ros.core.files import write_text
 from limbloc_ros.rig.formats.common import (
     WORLD_TO_CAMERA,
     Format,
@@ -24,7 +25,6 @@ from limbloc_ros.rig.formats.common import (
     matrix,
     only_file,
     row,
-    write_text,
 )
 from limbloc_ros.rig.plain_values import kind, numbers, parse, read_text, required
 

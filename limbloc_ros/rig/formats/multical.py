@@ -16,6 +16,7 @@ import numpy as np
 
 from limbloc_ros.core.camera import Rig
 from limbloc_ros.core.errors import RigError
+from limbloc_ros.core.files import write_text
 from limbloc_ros.rig.formats.common import (
     WORLD_TO_CAMERA,
     Format,
@@ -25,7 +26,6 @@ from limbloc_ros.rig.formats.common import (
     only_file,
     polynomial_model,
     pose_from_entry,
-    write_text,
 )
 from limbloc_ros.rig.plain_values import flattened, kind, numbers, parse, read_text, required
 

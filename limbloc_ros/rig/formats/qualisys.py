@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from limbloc_ros.core.camera import Rig
 from limbloc_ros.core.errors import RigError
+from limbloc_ros.core.files import write_text
 from limbloc_ros.rig.formats.common import (
     CAMERA_TO_WORLD,
     Format,
@@ -24,7 +25,6 @@ from limbloc_ros.rig.formats.common import (
     five_coefficients,
     only_file,
     polynomial_model,
-    write_text,
 )
 from limbloc_ros.rig.plain_values import read_text, usable
 

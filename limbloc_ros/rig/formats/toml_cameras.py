@@ -17,6 +17,7 @@ import cv2
 
 from limbloc_ros.core.camera import Camera, Rig
 from limbloc_ros.core.errors import RigError
+from limbloc_ros.core.files import write_text
 from limbloc_ros.rig.formats.common import (
     WORLD_TO_CAMERA,
     Format,
@@ -29,7 +30,6 @@ from limbloc_ros.rig.formats.common import (
     polynomial_model,
     pose_from_entry,
     row,
-    write_text,
 )
 from limbloc_ros.rig.plain_values import numbers, read_text, required
 
