@@ -26,6 +26,7 @@ ALLOWED = {
 #: Modules of the core, as the data flows; each may import only what stands before it.
 CORE_ORDER = (
     "errors",
+    "files",
     "config",
     "camera",
     "lens",
@@ -57,6 +58,7 @@ CORE_ORDER = (
     "ros4hri",
     "confidence",
     "pipeline",
+    "parts",
     "people",
 )
 

@@ -4,6 +4,8 @@
 import copy
 import json
 import re
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ import yaml
 from limbloc_ros.core.camera import Camera, Rig
 from limbloc_ros.core.errors import RigError
 from limbloc_ros.rig.rig_file import load_rig, rig_from_mapping, save_rig
+from limbloc_ros.simulation.room import default_rig
 
 #: A camera 2 m in front of the origin at 1 m height, looking back along -x: optical z = -x, x = y, y = -z.
 T_WORLD_CAMERA = [[0.0, 0.0, -1.0, 2.0], [1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 1.0], [0.0, 0.0, 0.0, 1.0]]
@@ -215,3 +218,27 @@ def test_missing_file_folder_and_binary(tmp_path):
     (tmp_path / "rig.yaml").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(RigError, match="expected UTF-8 text"):
         load_rig(tmp_path / "rig.yaml")
+
+
+FULL_DISK = """
+import resource, signal, sys
+from limbloc_ros.core.errors import RigError
+from limbloc_ros.rig.rig_file import save_rig
+from limbloc_ros.simulation.room import default_rig
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (200, 200))
+try:
+    save_rig(default_rig(8), sys.argv[1])
+except RigError as error:
+    print(error)
+"""
+
+
+def test_a_full_disk_leaves_the_old_calibration_untouched(tmp_path):
+    path = tmp_path / "rig.yaml"
+    save_rig(default_rig(3), path)
+    before = path.read_bytes()
+    done = subprocess.run([sys.executable, "-c", FULL_DISK, str(path)], capture_output=True, text=True, check=True)
+    assert "cannot be written: File too large" in done.stdout
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]  # nor is half a file left beside it

@@ -13,9 +13,9 @@ import numpy as np
 from tqdm import tqdm
 
 from limbloc_ros.core.errors import ConfigError, InputError
+from limbloc_ros.core.files import replaced, write_text
 from limbloc_ros.export import bvh, c3d_file, trc
 from limbloc_ros.export.clip import Clip, clip_of
-from limbloc_ros.export.files import replaced, write_text
 from limbloc_ros.export.gltf import write_gltf
 from limbloc_ros.export.hulls import kept_masks, recorded_masks, write_hulls
 from limbloc_ros.export.markers import MARKER_SETS

@@ -15,6 +15,7 @@ from limbloc_ros.commands._rig_footage import count_sets, find_cameras, image_se
 from limbloc_ros.commands.rig_import import describe
 from limbloc_ros.core.camera import Rig
 from limbloc_ros.core.errors import ConfigError, InputError, OutputError, RigError
+from limbloc_ros.core.files import write_bytes, write_text
 from limbloc_ros.rig.advice import CameraQuality, assess, what_to_record
 from limbloc_ros.rig.board import Board, parse_board
 from limbloc_ros.rig.bundle import View
@@ -255,12 +256,8 @@ def write_report(
         rows = [(f"{i + 1}", line) for i, line in enumerate(result.dropped)]
         sections.append(Section("dropped", "Thrown away", "Views that did not fit.", tables=[Table(rows)]))
     about = [f"{len(rig.cameras)} cameras, {len(result.views)} views of {board}"]
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for name, data in pictures.items():
-            (folder / name).write_bytes(data)
-        page = folder / "calibration.html"
-        page.write_text(build_page("limbloc: calibration", about, sections, "limbloc rig calibrate"), encoding="utf-8")
-    except OSError as error:
-        raise OutputError(f"report {folder} cannot be written: {error.strerror}") from None
+    for name, data in pictures.items():
+        write_bytes(folder / name, data)
+    page = folder / "calibration.html"
+    write_text(page, build_page("limbloc: calibration", about, sections, "limbloc rig calibrate"))
     return page

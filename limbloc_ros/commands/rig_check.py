@@ -11,7 +11,8 @@ import numpy as np
 from tqdm import tqdm
 
 from limbloc_ros.core.camera import Rig
-from limbloc_ros.core.errors import ConfigError, InputError, OutputError
+from limbloc_ros.core.errors import ConfigError, InputError
+from limbloc_ros.core.files import write_bytes, write_text
 from limbloc_ros.recordings.config_file import load_config
 from limbloc_ros.recordings.open_source import open_source
 from limbloc_ros.rig.check import GOOD, Report, check
@@ -167,14 +168,8 @@ def write_report(rig: Rig, report: Report, folder: Path, source: str) -> Path:
                     "easily: what is dark here is badly wrong.", pictures["pairs.png"], "matrix of pairs")
         )  # fmt: skip
     sections.append(Section("rig", "The room", "Cameras and carve volume.", pictures["rig.png"], "cameras", wide=True))
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for name, data in pictures.items():
-            (folder / name).write_bytes(data)
-        page = folder / "check.html"
-        page.write_text(
-            build_page("limbloc: check of a rig", [source], sections, "limbloc rig check"), encoding="utf-8"
-        )
-    except OSError as error:
-        raise OutputError(f"report {folder} cannot be written: {error.strerror}") from None
+    for name, data in pictures.items():
+        write_bytes(folder / name, data)
+    page = folder / "check.html"
+    write_text(page, build_page("limbloc: check of a rig", [source], sections, "limbloc rig check"))
     return page

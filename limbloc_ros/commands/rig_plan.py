@@ -10,7 +10,8 @@ from tqdm import tqdm
 
 from limbloc_ros.commands.rig_import import describe, size
 from limbloc_ros.core.camera import Rig
-from limbloc_ros.core.errors import ConfigError, OutputError
+from limbloc_ros.core.errors import ConfigError
+from limbloc_ros.core.files import write_bytes
 from limbloc_ros.rig.plan import (
     Coverage,
     Fatness,
@@ -121,10 +122,6 @@ def _compare(args: argparse.Namespace) -> int:
 
 
 def _write(folder: Path, pictures: dict[str, bytes]) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for name, data in pictures.items():
-            (folder / name).write_bytes(data)
-    except OSError as error:
-        raise OutputError(f"--out {folder} cannot be written: {error.strerror}") from None
+    for name, data in pictures.items():
+        write_bytes(folder / name, data)
     print(f"pictures: {', '.join(str(folder / name) for name in pictures)}")

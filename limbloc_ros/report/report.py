@@ -7,7 +7,8 @@ import datetime
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from limbloc_ros.core.errors import InputError
+from limbloc_ros.core.errors import InputError, OutputError
+from limbloc_ros.core.files import write_bytes
 from limbloc_ros.report.compare import limb_angles
 from limbloc_ros.report.page import Section, Table, build_page
 from limbloc_ros.report.plots_motion import ranges_table
@@ -52,16 +53,17 @@ def write_report(
             if on_picture is not None:
                 on_picture(picture.heading, number, len(todo))
             png = picture.make()
-            _write(folder / f"{picture.key}.png", png)
+            write_bytes(folder / f"{picture.key}.png", png)
             sections.append(Section(picture.key, picture.heading, picture.text, png, wide=picture.wide))
         sections += _closing_sections(run)
         when = (created or datetime.datetime.now().astimezone()).strftime("%Y-%m-%d %H:%M %Z").strip()
         about = [line for line in (run.source, f"limbloc_ros {run.version}, {when}") if line]
         page = build_page(run.title, about, sections, f"Made by limbloc_ros {run.version} on {when}.")
-        _write(folder / PAGE, page.encode("utf-8"))
-    except OSError as error:
+        write_bytes(folder / PAGE, page.encode("utf-8"))
+    except (OSError, OutputError) as error:
+        why = getattr(error, "strerror", "") or error
         raise InputError(
-            f"the report cannot be written to {folder}: {error.strerror or error}; make room or choose another folder"
+            f"the report cannot be written to {folder}: {why}; make room or choose another folder"
         ) from error
     return folder / PAGE
 
@@ -107,10 +109,3 @@ def _closing_sections(run: RunData) -> list[Section]:
     if rows:
         found.append(Section("settings", "How it was made", tables=[Table(rows, code_values=True)]))
     return found
-
-
-def _write(path: Path, data: bytes) -> None:
-    """Write a file under a temporary name and rename it: no reader ever sees half of it."""
-    temporary = path.with_name(f".{path.name}.writing")
-    temporary.write_bytes(data)
-    temporary.replace(path)

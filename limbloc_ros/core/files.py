@@ -35,3 +35,9 @@ def write_text(path: Path, text: str) -> None:
     """Write a text file in UTF-8; raises OutputError as `replaced`."""
     with replaced(path) as temporary:
         temporary.write_text(text, encoding="utf-8", newline="\n")
+
+
+def write_bytes(path: Path, data: bytes) -> None:
+    """Write a file; raises OutputError as `replaced`."""
+    with replaced(path) as temporary:
+        temporary.write_bytes(data)
