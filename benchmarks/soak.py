@@ -106,18 +106,20 @@ def main() -> int:
     """Run, print, judge."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--minutes", type=float, default=30.0, help="after the warm-up")
-    parser.add_argument("--warm-up", type=float, default=2.0, metavar="MINUTES")
+    parser.add_argument("--warm-up", type=float, default=5.0, metavar="MINUTES")
     parser.add_argument("--cameras", type=int, default=8)
     parser.add_argument("--rate", type=float, default=5.0, help="images a second of each camera")
     parser.add_argument("--csv", type=Path, help="write the samples to this file")
     args = parser.parse_args()
     live = Live(cameras=args.cameras, rate_hz=args.rate)
     samples, verdict = soak(live, 60 * args.minutes, 10.0, 60 * args.warm_up)
-    lines = ["minutes,rss_mb,threads,files,segments,rate_hz,wrong"]
+    names = list(samples[0].held.each_mb)
+    lines = [f"minutes,{','.join(f'{name}_mb' for name in names)},rss_mb,threads,files,segments,rate_hz,wrong"]
     for s in samples:
         h = s.held
+        each = ",".join(str(h.each_mb.get(name, "")) for name in names)
         lines.append(
-            f"{s.at_s / 60:.2f},{h.rss_mb:.1f},{h.threads},{h.files},{len(h.segments)},{s.rate_hz:.2f},{s.wrong}"
+            f"{s.at_s / 60:.2f},{each},{h.rss_mb:.1f},{h.threads},{h.files},{len(h.segments)},{s.rate_hz:.2f},{s.wrong}"
         )
     print("\n".join(lines[:1] + lines[1 :: max(len(lines) // 20, 1)]))
     if args.csv:

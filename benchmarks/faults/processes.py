@@ -15,7 +15,7 @@ class Footprint:
     """Sums over processes.
 
     Attributes:
-        rss_mb: resident memory without mapped files and shared memory, MB.
+        rss_mb: resident memory without mapped files and shared memory, MB; `each_mb` of each process, by name.
         threads, files: threads and open file descriptors.
         segments: names of the files in /dev/shm that they have mapped.
     """
@@ -24,13 +24,15 @@ class Footprint:
     threads: int
     files: int
     segments: frozenset[str]
+    each_mb: dict[str, float]
 
 
 def footprint(pids: Mapping[str, int]) -> Footprint:
     """What these processes hold now; those that have ended meanwhile count nothing."""
-    rss = threads = files = 0
+    threads = files = 0
+    each: dict[str, float] = {}
     segments: set[str] = set()
-    for pid in pids.values():
+    for name, pid in pids.items():
         try:
             status = Path(f"/proc/{pid}/status").read_text().splitlines()
             files += len(list(Path(f"/proc/{pid}/fd").iterdir()))
@@ -39,11 +41,19 @@ def footprint(pids: Mapping[str, int]) -> Footprint:
             continue
         values = {line.split(":")[0]: line.split()[1] for line in status if line.startswith(("RssAnon", "Threads"))}
         segments |= {word.split("/dev/shm/")[1] for word in maps.split() if word.startswith("/dev/shm/")}
-        rss += int(values["RssAnon"])
+        each[name] = round(int(values["RssAnon"]) / 1024, 1)
         threads += int(values["Threads"])
-    return Footprint(round(rss / 1024, 1), threads, files, frozenset(segments))
+    return Footprint(round(sum(each.values()), 1), threads, files, frozenset(segments), each)
 
 
 def left_behind(segments: frozenset[str]) -> list[str]:
-    """Those of the shared memory files that still exist."""
-    return sorted(name for name in segments if (SHARED / name).exists())
+    """Those of the shared memory files of DDS that still exist though no process uses them any more."""
+    there = {name for name in segments if "fast" in name and (SHARED / name).exists()}
+    for process in Path("/proc").iterdir():
+        if process.name.isdecimal() and there:
+            try:
+                maps = (process / "maps").read_text()
+            except OSError:
+                continue  # it has ended
+            there -= {name for name in there if f"{SHARED}/{name}\n" in maps}
+    return sorted(there)
