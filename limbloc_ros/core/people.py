@@ -29,16 +29,15 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import map_coordinates
 from scipy.optimize import linear_sum_assignment
-from scipy.spatial import cKDTree
 
 from limbloc_ros.core import figure
 from limbloc_ros.core.config import FitConfig
 from limbloc_ros.core.errors import InputError, NoPerson
 from limbloc_ros.core.figure import FigureState
-from limbloc_ros.core.hull import NOBODY, Hull, components, largest_component
+from limbloc_ros.core.hull import Hull
 from limbloc_ros.core.joint_angles import ContinuousAngles
+from limbloc_ros.core.parts import FURTHER_PARTS, Part, Sight, divide, nearest
 from limbloc_ros.core.pipeline import PoseEstimator
 from limbloc_ros.core.pose import Flesh, Pose
 
@@ -46,84 +45,24 @@ Array = NDArray[np.float64]
 
 #: A body that has not been seen for so long loses its number, s.
 FORGET_S = 2.0
-#: Parts of a frame beyond the number of people that are looked at: furniture.
-FURTHER_PARTS = 4
-#: Points by which a part of the hull is known.
-POINTS = 300
 #: A part may be so far from where a body is expected, m, and so much more for each second since it was seen.
 GATE_M, GATE_M_S = 0.4, 1.5
 #: A body lies within a part that others have taken when it is no further than this from it, m (points are coarse).
 WITHIN_M, WITHIN_M_S = 0.10, 0.3
 #: Price of sharing a part, m, and how much of the tracks' volumes a shared part must have.
 SHARE_M, SHARED_VOLUME = 0.12, 0.6
-#: Distances for cutting a part up are worked out at every so many voxels.
-COARSE = 3
-#: Fits in favour that make a person, and against that make furniture, which is looked at again after REST_S or when it
-#: has moved by MOVED_M.
-PERSON, FURNITURE = 3, -4
-REST_S, MOVED_M = 2.0, 0.10
+#: Fits in favour, one after the other, that make a person, and against that make furniture. That is looked at again,
+#: from scratch, after REST_S and then after twice as long each time, up to LONGEST_REST_S; sooner, after HASTE_S, when
+#: its centre has moved by MOVED_M or its volume changed by this share: somebody who has just come in.
+PERSON, FURNITURE = 3, -3
+REST_S, LONGEST_REST_S, HASTE_S = 2.0, 16.0, 0.8
+MOVED_M, CHANGED = 0.10, 0.10
 #: Who had no reliable fit for so long is no longer taken for a person, s: perhaps it is the chair that somebody left.
 DOUBT_S = 10.0
 #: Nobody walks faster, m/s; no prediction reaches further, s.
 FASTEST_M_S, HORIZON_S = 2.5, 0.5
 #: Statures of people, m.
 STATURES_M = (0.8, 2.3)
-
-
-@dataclass(frozen=True)
-class Part:
-    """A connected part of a hull as the tracks see it.
-
-    Attributes:
-        points: [M, 3] some of the voxel centres inside, evenly picked, m.
-        centre: [3] mean of all of them, m.
-        volume_m3: of the voxels inside.
-    """
-
-    points: Array
-    centre: Array
-    volume_m3: float
-
-    @staticmethod
-    def of(hull: Hull) -> Part:
-        """What is to be known of a hull in one part."""
-        local = np.stack(np.nonzero(hull.sdf < 0), axis=1)
-        centres = (local + np.asarray(hull.index_min) + 0.5) * hull.voxel_m
-        return Part(centres[:: max(1, len(local) // POINTS)], centres.mean(axis=0), len(local) * hull.voxel_m**3)
-
-
-@dataclass(frozen=True)
-class Sight:
-    """The parts of one frame's hull, the largest first.
-
-    Attributes:
-        parts: one for each.
-        hulls: gives their hulls; only called when they are needed.
-        outcomes: what fits of each part alone gave, where that is known already; only for frames fitted alone.
-    """
-
-    parts: tuple[Part, ...]
-    hulls: Callable[[], Sequence[Hull]]
-    outcomes: tuple[Pose | NoPerson, ...] = ()
-
-    @staticmethod
-    def of(hull: Hull, max_people: int) -> Sight:
-        """What there is to see in a hull as it was carved."""
-        hulls = candidates(hull, max_people)
-        return Sight(tuple(Part.of(part) for part in hulls), lambda: hulls)
-
-    def fit(self, n: int, estimator: PoseEstimator) -> Pose | NoPerson:
-        """The pose of part n, by itself."""
-        return self.outcomes[n] if self.outcomes else estimator.estimate(self.hulls()[n])
-
-
-def candidates(hull: Hull, max_people: int) -> list[Hull]:
-    """The parts of a carved hull that are looked at, the largest first."""
-    if hull.inside_count == 0:
-        return []
-    if max_people == 1:
-        return [largest_component(hull)]
-    return [part for part in components(hull) if part.inside_count][: max_people + FURTHER_PARTS]
 
 
 @dataclass(frozen=True)
@@ -145,9 +84,11 @@ class _Track:
         points, centre, volume_m3: what it last had of the hull; the volume is of frames in which it shared nothing.
         velocity: [3] m/s.
         shared: whether it shared its part when it was last seen.
-        score: fits in favour of a person less those against. trusted_ns: when the last one was in favour.
+        score: how many fits in a row were in favour of a person, or (negative) against.
+        trusted_ns: when the last one was in favour.
         shown_ns: since when it is among the bodies that are returned.
-        looked_ns, looked_at: when and where a figure was last fitted.
+        looked_ns, looked_at, looked_m3: when, where and in how large a part a figure was last fitted.
+        rest_s: how long furniture rests before that is done again.
         outcome: of that fit.
     """
 
@@ -167,6 +108,8 @@ class _Track:
     shown_ns: int | None = None
     looked_ns: int | None = None
     looked_at: Array = field(default_factory=lambda: np.zeros(3))
+    looked_m3: float = 0.0
+    rest_s: float = REST_S
     outcome: Pose | NoPerson = field(default_factory=lambda: NoPerson("not seen yet"))
 
     def absent_s(self, stamp_ns: int) -> float:
@@ -199,24 +142,27 @@ class _Track:
 
     def judge(self, stamp_ns: int, outcome: Pose | NoPerson) -> None:
         """Take note of a fit."""
-        self.outcome, self.looked_ns, self.looked_at = outcome, stamp_ns, self.centre
+        if self.score == FURNITURE:
+            self.rest_s = REST_S if self._changed() else min(2.0 * self.rest_s, LONGEST_REST_S)
+        self.outcome, self.looked_ns = outcome, stamp_ns
+        self.looked_at, self.looked_m3 = self.centre, self.volume_m3
         good = False
         if isinstance(outcome, Pose):
             self.state = FigureState.from_vector(outcome.parameters)
             good = outcome.reliable and STATURES_M[0] <= outcome.sizes["stature"] <= STATURES_M[1]
         if good:
             self.trusted_ns = stamp_ns
-        self.score = min(max(self.score + (1 if good else -1), FURNITURE), PERSON)
+        self.score = min(max(self.score, 0) + 1, PERSON) if good else max(min(self.score, 0) - 1, FURNITURE)
 
     def rests(self, stamp_ns: int) -> bool:
-        """Furniture that stands where it stood need not be looked at in every frame."""
-        return (
-            self.number == 0
-            and self.score == FURNITURE
-            and self.looked_ns is not None
-            and (stamp_ns - self.looked_ns) * 1e-9 < REST_S
-            and float(np.linalg.norm(self.centre - self.looked_at)) < MOVED_M
-        )
+        """Furniture need not be looked at in every frame."""
+        if self.number or self.score > FURNITURE or self.looked_ns is None:
+            return False
+        return (stamp_ns - self.looked_ns) * 1e-9 < (HASTE_S if self._changed() else self.rest_s)
+
+    def _changed(self) -> bool:
+        moved = float(np.linalg.norm(self.centre - self.looked_at))
+        return moved > MOVED_M or abs(self.volume_m3 - self.looked_m3) > CHANGED * self.looked_m3
 
 
 class People:
@@ -316,6 +262,8 @@ class People:
                 if self._alone is None and not any(other.number for other in self._tracks):
                     self._alone = track  # the largest part in a room in which nobody is known
                 if track is self._alone or not track.rests(stamp_ns):
+                    if track is not self._alone and track.score == FURNITURE and not track.number:
+                        track.estimator.reset()  # what has led astray is of no use
                     track.judge(stamp_ns, sight.fit(n, track.estimator))
                 taken.append(track)
                 continue
@@ -345,8 +293,8 @@ class People:
             flesh = track.flesh(stamp_ns)
             own = track.points + track.shift(stamp_ns) if flesh is None else flesh.centres
             for n, part in enumerate(parts):
-                apart[t, n] = _nearest(part.points, own).mean()
-                back = _nearest(own, part.points) if flesh is None else figure.flesh_distance(part.points, flesh)[0]
+                apart[t, n] = nearest(part.points, own).mean()
+                back = nearest(own, part.points) if flesh is None else figure.flesh_distance(part.points, flesh)[0]
                 cost[t, n] = apart[t, n] + 0.5 * np.maximum(back, 0.0).mean()
         waited = np.array([[min(track.absent_s(stamp_ns), 1.0)] for track in tracks])
         never = 1e3
@@ -426,56 +374,23 @@ def _distance(track: _Track, stamp_ns: int) -> Callable[[Array], Array]:
         return lambda query: figure.flesh_distance(query, flesh)[0]
     points = track.points + track.shift(stamp_ns)
     spacing = 0.5 * (track.volume_m3 / max(len(points), 1)) ** (1 / 3)
-    return lambda query: _nearest(points, query) - spacing
-
-
-def _nearest(points: Array, query: Array) -> Array:
-    """Distance [Q], m, of each of query [Q, 3] to the nearest of the points [M, 3]."""
-    return np.asarray(cKDTree(points).query(query)[0], dtype=np.float64)
-
-
-def divide(hull: Hull, distances: Sequence[Callable[[Array], Array]]) -> list[Hull | None]:
-    """Cut a hull that holds several bodies apart, half-way between them.
-
-    Args:
-        hull: in one part.
-        distances: of each body: points [Q, 3] m -> signed distances [Q] m to where it should be.
-
-    Returns:
-        each body's hull, or None where nothing is left for it.
-    """
-    indices, values = hull.shell()
-    away = np.stack([_at_voxels(hull, distance, indices) for distance in distances])
-    inside = hull.sdf < np.float32(hull.band_m)
-    cut_by = None if hull.cut_by is None else hull.cut_by[inside]
-    pieces: list[Hull | None] = []
-    for n in range(len(distances)):
-        border = (0.5 * (away[n] - np.delete(away, n, axis=0).min(axis=0))).astype(np.float32)
-        sdf: NDArray[np.float32] = np.maximum(values, border)
-        near = sdf < np.float32(hull.band_m)
-        if not (sdf < 0).any():
-            pieces.append(None)
-            continue
-        who = None if cut_by is None else np.where(border > values, np.uint8(NOBODY), cut_by)[near]
-        piece = Hull.from_shell(
-            hull.voxel_m, hull.band_m, indices[near], sdf[near], hull.cameras, hull.rejected, who, hull.viewpoints
-        )
-        pieces.append(largest_component(piece))
-    return pieces
-
-
-def _at_voxels(hull: Hull, distance: Callable[[Array], Array], indices: NDArray[np.int32]) -> Array:
-    """A signed distance [V] at voxels [V, 3], interpolated from every COARSE-th: ten times as fast, to a centimetre."""
-    axes = [np.arange(0, n + COARSE - 1, COARSE) for n in hull.sdf.shape]
-    nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-    places = (nodes.reshape(-1, 3) + np.asarray(hull.index_min) + 0.5) * hull.voxel_m
-    grid = distance(places).reshape(nodes.shape[:3])
-    at = (indices - np.asarray(hull.index_min)).T / COARSE
-    return np.asarray(map_coordinates(grid, at, order=1, mode="nearest"), dtype=np.float64)
+    return lambda query: nearest(points, query) - spacing
 
 
 #: What of a track a snapshot holds as it is, and as lists.
-_PLAIN = ("number", "since_ns", "seen_ns", "volume_m3", "shared", "score", "trusted_ns", "shown_ns", "looked_ns")
+_PLAIN = (
+    "number",
+    "since_ns",
+    "seen_ns",
+    "volume_m3",
+    "shared",
+    "score",
+    "trusted_ns",
+    "shown_ns",
+    "looked_ns",
+    "looked_m3",
+    "rest_s",
+)
 _ARRAYS = ("points", "centre", "velocity", "looked_at")
 
 

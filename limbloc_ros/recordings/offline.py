@@ -38,7 +38,8 @@ from limbloc_ros.core.camera import Rig
 from limbloc_ros.core.config import BackgroundConfig, FitConfig, HullConfig, SyncConfig
 from limbloc_ros.core.errors import InputError, Interrupted, NoPerson
 from limbloc_ros.core.hull import Hull
-from limbloc_ros.core.people import Body, Part, People, Sight, candidates
+from limbloc_ros.core.parts import Part, Sight, candidates
+from limbloc_ros.core.people import Body, People
 from limbloc_ros.core.pipeline import Carver, PoseEstimator
 from limbloc_ros.core.pose import Pose
 from limbloc_ros.recordings.cases import pack_mask, unpack_mask
