@@ -60,6 +60,9 @@ WHOLE = block_of(
         for row in (*_TORSO_ROWS, *(row for kind, side in _LIMBS for row in _limb_rows(kind, side)))
     ],
 )
+#: A larger hull is no person, and would take long: four heavy people's bodies, three times the largest hull in dresses
+#: and before few cameras.
+LARGEST_M3 = 0.4
 #: A reading whose energy is higher than this is probably wrong: more heads are tried.
 DOUBTFUL = 0.36
 #: So many pairs of limbs are posed and compared by their energy.
@@ -132,6 +135,9 @@ def fit_state(hull: Hull) -> tuple[Branch, Description] | NoPerson:
         the reading of the hull with the lowest energy and what section 2.1 computes from the hull, or why there is
         none. A poor reading is no error: its energy says so.
     """
+    volume = hull.inside_count * hull.voxel_m**3
+    if volume > LARGEST_M3:
+        return NoPerson(f"the hull's volume is {volume:.2f} m3: expected at most {LARGEST_M3} m3 of a person")
     seen = describe(hull)
     grid = Grid.of(hull)
     heads = anchor.find_heads(grid, seen.surface, seen.patch_curvature, seen.centre_of_mass)
