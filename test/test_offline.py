@@ -12,6 +12,7 @@ import pytest
 from limbloc_ros.core.config import FitConfig, HullConfig
 from limbloc_ros.core.errors import ConfigError, InputError, Interrupted, NoPerson, RigError
 from limbloc_ros.core.images import binary
+from limbloc_ros.core.pipeline import Carver, PoseEstimator
 from limbloc_ros.core.pose import JOINT
 from limbloc_ros.recordings import offline
 from limbloc_ros.recordings.bags import BagWriter
@@ -274,3 +275,16 @@ def test_results_say_what_was_run(reference, case_folder, tmp_path):
     assert about["consecutive"] is True
     assert about["config"]["fit"]["engine"] == "robust"
     assert about["version"]
+
+
+def test_the_order_of_frames_and_cameras_changes_nothing(case_folder, reference):
+    """Each frame alone: last first, with the cameras the other way round, by one estimator that has seen others."""
+    case = load_case(case_folder)
+    carver, estimator = Carver(case.rig, HullConfig()), PoseEstimator(FitConfig())
+    for frame in reversed(range(FRAMES - 1)):
+        hull = carver.carve(dict(reversed(case.masks(frame).items())))
+        pose = estimator.estimate(hull)
+        expected = reference.frames[frame].outcome
+        for name in ("joints", "rotations", "parameters", "sigma"):
+            np.testing.assert_array_equal(getattr(pose, name), getattr(expected, name))
+        assert pose.energy == expected.energy
