@@ -327,6 +327,18 @@ def test_ball():
     assert 0.98 < excess[-1] < 1.04 and excess[0] > 1.1
 
 
+def test_the_area_that_the_volumes_walls_cut():
+    """A ball whose centre lies in a wall, or in an edge of two walls, is cut in discs; on the floor it is not cut."""
+    rig = ring(12, radius=4.0, focal=220.0, size=(480, 360))
+    disc = np.pi * 0.3**2
+    balls = ((0.0, 0.0, 1.0), 0.0), ((1.0, 0.0, 1.0), disc), ((0.0, -1.0, 1.0), disc), ((0.0, 0.0, 2.0), disc), \
+        ((-1.0, 0.0, 2.0), disc), ((0.0, 0.0, 0.0), 0.0)  # fmt: skip
+    for centre, area in balls:
+        hull = carve(ball_masks(rig, [(np.array(centre), 0.3)]), rig, HullConfig(voxel_m=0.02, min_share=0.0))
+        assert isinstance(hull, Hull)
+        assert hull.cut_area_m2 == pytest.approx(area, rel=0.15), centre
+
+
 def test_shell_rebuilds_the_hull_bit_for_bit():
     hull = carve(ball_masks(ring(6), [((0.0, 0.0, 1.0), 0.4)]), ring(6), HullConfig(voxel_m=0.05, min_voxels=10))
     assert isinstance(hull, Hull)

@@ -240,3 +240,16 @@ def test_the_papers_engine_gives_poses_too():
 
 def test_warm_up_needs_no_room():
     Carver.warm_up()  # that of the fitting half runs with every pose node, see test_pose_node.py
+
+
+def test_half_a_person_at_the_wall_of_the_volume_is_not_reliable():
+    whole = hull_of(FRAMES[0])
+    assert whole.cut_area_m2 == 0.0
+    assert PoseEstimator().estimate(whole).reliable
+    middle = whole.sdf.shape[0] // 2
+    sdf = whole.sdf[:middle].copy()
+    cut = Hull(whole.voxel_m, whole.index_min, sdf, whole.band_m)
+    half = Hull.from_shell(whole.voxel_m, whole.band_m, *cut.shell())
+    assert half.cut_area_m2 > 0.1
+    found = PoseEstimator().estimate(half)
+    assert isinstance(found, NoPerson) or not found.reliable

@@ -81,6 +81,20 @@ class Hull:
         """Number of voxels inside."""
         return int((self.sdf < 0).sum())
 
+    @property
+    def cut_area_m2(self) -> float:
+        """How much of the carve volume's walls and ceiling lies inside the hull, m^2: what is beyond was not carved.
+
+        Elsewhere the signed distance grows by no more than a voxel from voxel to voxel; there it jumps.
+        """
+        faces = 0
+        for axis in range(3):
+            first, second, before, last = (np.take(self.sdf, i, axis=axis) for i in (0, 1, -2, -1))
+            faces += int(np.count_nonzero((before < 0) & (last >= self.band_m)))
+            if axis < 2:  # people stand on the floor
+                faces += int(np.count_nonzero((second < 0) & (first >= self.band_m)))
+        return float(faces) * self.voxel_m**2
+
     def shell(self) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
         """The voxels that matter: the inside and the thin shell around it.
 

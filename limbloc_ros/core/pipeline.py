@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections.abc import Mapping
 
@@ -19,6 +20,9 @@ from limbloc_ros.core.pose import Pose
 from limbloc_ros.core.silhouettes import measure_silhouettes, pack_cameras
 from limbloc_ros.core.surface import extract_surface
 from limbloc_ros.core.tracker import Tracker
+
+#: A hull that the carve volume's walls cut by more than this, m^2, is no whole person; an arm is thinner.
+CUT_M2 = 0.02
 
 
 class Carver:
@@ -70,7 +74,7 @@ class PoseEstimator:
             clock.lap("fit")
             if isinstance(found, NoPerson):
                 return found
-            return describe_pose(found[0].state, hull, None, clock.stage_ms)
+            return _whole(describe_pose(found[0].state, hull, None, clock.stage_ms), hull)
         surface = extract_surface(hull)
         clock.lap("surface")
         if self.config.temporal:
@@ -80,7 +84,7 @@ class PoseEstimator:
         clock.lap("fit")
         if fit is None:
             return NoPerson("the hull holds nothing that a torso fits into")
-        return describe_pose(fit.state, hull, fit.system, clock.stage_ms, fit.rivals)
+        return _whole(describe_pose(fit.state, hull, fit.system, clock.stage_ms, fit.rivals), hull)
 
     def reset(self) -> None:
         """Forget the last frame (a new recording, a jump back in time)."""
@@ -95,6 +99,11 @@ class PoseEstimator:
         estimator = PoseEstimator(FitConfig(temporal=True))
         estimator.estimate(hull)
         estimator.estimate(hull)
+
+
+def _whole(pose: Pose, hull: Hull) -> Pose:
+    """The same, and not reliable when the carve volume's walls cut the person: half a person looks like another one."""
+    return dataclasses.replace(pose, reliable=pose.reliable and hull.cut_area_m2 < CUT_M2)
 
 
 class _Stopwatch:

@@ -17,6 +17,7 @@ from limbloc_ros.core.camera import Rig
 from limbloc_ros.core.errors import NoPerson
 from limbloc_ros.core.hull import Hull
 from limbloc_ros.core.images import Pixels
+from limbloc_ros.core.pipeline import CUT_M2
 from limbloc_ros.core.synchroniser import FrameSet, StampSynchroniser, SyncCounters
 from limbloc_ros.rig.watch import ConsistencyWatch
 from limbloc_ros.ros.backlog import Backlog
@@ -123,6 +124,8 @@ class CarvingReport:
             message = f"no person: {self._outcome.reason}"
         elif self._outcome is not None:
             voxels, used = self._outcome.inside_count, self._outcome.cameras
+            if self._outcome.cut_area_m2 > CUT_M2:
+                level, message = WARN, "somebody stands half outside of the carve volume (volume in the rig file)"
         if time.monotonic() - self._jumped_s < WINDOW_S:
             level, message = (
                 WARN,
