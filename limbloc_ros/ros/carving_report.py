@@ -87,7 +87,7 @@ class CarvingReport:
         self._look_back(counters)
         return [
             self._hull(synchroniser, counters, backlog, problems),
-            *(self._camera(c, counters, problems) for c in self._topics),
+            *(self._camera(c, counters, problems, bool(backlog.behind)) for c in self._topics),
         ]
 
     def _look_back(self, counters: SyncCounters) -> None:
@@ -156,14 +156,16 @@ class CarvingReport:
         }
         return make_status(f"{self._node.get_name()}: hull", level, message, values)
 
-    def _camera(self, camera: str, counters: SyncCounters, problems: Mapping[str, str]) -> DiagnosticStatus:
+    def _camera(
+        self, camera: str, counters: SyncCounters, problems: Mapping[str, str], behind: bool
+    ) -> DiagnosticStatus:
         meter, level, message = self._masks[camera], OK, "used"
         rejected = self._outcome.rejected if isinstance(self._outcome, Hull) else {}
         if camera in problems:
             level, message = ERROR, f"not in the rig: {problems[camera]}"
         elif meter.silence_s > SILENT_S:
             level, message = ERROR, self._why_silent(camera, meter.silence_s)
-        elif lost := self._why_lost(camera, counters):
+        elif not behind and (lost := self._why_lost(camera, counters)):
             level, message = WARN, lost
         elif camera in rejected:
             level, message = WARN, f"not used: {rejected[camera]}"
