@@ -294,7 +294,7 @@ def test_two_who_touch_keep_their_bodies_apart() -> None:
     stage = room(2, "touching")
     people = People(FitConfig(temporal=True))
     shared, owner, errors = 0, {}, []
-    for t in np.arange(4.75, 8.6, 0.25):
+    for t in np.arange(5.2, 7.0, 0.1):
         seen = people.look(carved(stage, float(t)))
         bodies = people.follow(seen, round(t * 1e9))
         shared += len(seen.parts) == 1
@@ -307,8 +307,8 @@ def test_two_who_touch_keep_their_bodies_apart() -> None:
     assert shared > 5
     assert sorted(owner) == [1, 2]
     assert sorted(owner.values()) == [0, 1]
-    assert np.median(errors) < 0.04
-    assert np.mean(errors) < 0.08
+    assert np.median(errors) < 0.04, np.round(errors, 3)
+    assert np.mean(errors) < 0.06
 
 
 def test_a_chair_beside_somebody_is_not_a_person() -> None:

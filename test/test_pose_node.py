@@ -23,8 +23,10 @@ from sensor_msgs.msg import CompressedImage, JointState, PointCloud2
 from std_msgs.msg import Header, String
 from visualization_msgs.msg import Marker, MarkerArray
 
+from limbloc_ros.core.config import FitConfig
 from limbloc_ros.core.errors import ConfigError, NoPerson
-from limbloc_ros.core.hull import Hull
+from limbloc_ros.core.hull import Hull, components
+from limbloc_ros.core.people import People
 from limbloc_ros.core.pipeline import Carver, PoseEstimator
 from limbloc_ros.core.pose import JOINT, Pose
 from limbloc_ros.core.ros4hri import ros4hri
@@ -34,7 +36,7 @@ from limbloc_ros.nodes.segmentation import SegmentationNode
 from limbloc_ros.nodes.simulated_cameras import SimulatedCamerasNode
 from limbloc_ros.rig.rig_file import save_rig
 from limbloc_ros.ros import topics
-from limbloc_ros.ros.body_output import body_pose
+from limbloc_ros.ros.body_output import body_id, body_pose
 from limbloc_ros.ros.cloud_messages import empty_hull_cloud, hull_to_cloud
 from limbloc_ros.ros.image_messages import message_to_mask
 from limbloc_ros.ros.messages import (
@@ -45,6 +47,7 @@ from limbloc_ros.ros.messages import (
     stamp_ns,
     status_values,
 )
+from limbloc_ros.simulation.company import company
 from limbloc_ros.simulation.room import SimulatedRoom, default_rig
 
 T0_NS = 1_000_000_000_000
@@ -231,6 +234,52 @@ def test_a_jump_back_in_time_starts_anew(graph: Graph, hull: Hull, offline: Pose
 def test_a_body_id_must_fit_into_names(graph: Graph) -> None:
     with pytest.raises(ConfigError, match="body_id"):
         graph.add(PoseNode, body_id="7 dwarfs")
+
+
+def test_everybody_has_topics_of_their_own(graph: Graph, room: SimulatedRoom) -> None:
+    """Two people: the same numbers as from the core, one set of topics each, and one leaves."""
+    both = SimulatedRoom(room.rig, motions=company(2, "apart", empty_s=0.0))
+    carver, people = Carver(room.rig), People(FitConfig(temporal=True))
+    hulls = [carver.carve({n: both.render_with_mask(n, t)[1] for n in both.rig.names}) for t in (5.0, 5.1, 5.2, 5.3)]
+    assert all(isinstance(hull, Hull) for hull in hulls)
+    expected = [people.follow(people.look(hull), T0_NS + n * FRAME_NS) for n, hull in enumerate(hulls)]
+    assert [body.number for body in expected[-1]] == [1, 2]
+    node = graph.add(PoseNode, fit__temporal=True, body_id="anna")
+    tracked: list[IdsList] = []
+    node.bodies._ids_list, node.bodies._tracked = IdsList, types.SimpleNamespace(publish=tracked.append)
+    ids = ("anna", "anna2")
+    joints = {i: graph.collect(PoseArray, f"humans/bodies/{i}/joints") for i in ids}
+    native = {i: graph.collect(JointState, f"humans/bodies/{i}/joint_angles") for i in ids}
+    states = {i: graph.collect(JointState, f"humans/bodies/{i}/joint_states") for i in ids}
+    markers = graph.collect(MarkerArray, "markers")
+    carvings = Carvings(graph)
+    for n, hull in enumerate(hulls):
+        first = carvings.send(hull, n)
+        graph.spin(0.1)
+    (_, one), (_, two) = ((body.number, body.outcome) for body in expected[-1])
+    assert message_to_joints(first).tobytes() == one.joints.tobytes()
+    graph.until(lambda: len(joints["anna2"]) == len(native["anna2"]) >= 1 and len(markers) == len(hulls))
+    for i, pose in (("anna", one), ("anna2", two)):
+        assert message_to_joints(joints[i][-1]).tobytes() == pose.joints.tobytes()
+        assert message_to_angles(native[i][-1]) == pose.angles
+        assert all(name.endswith(f"_{i}") for name in states[i][-1].name)
+    assert tracked[-1].ids == ["anna", "anna2"]
+    assert {marker.ns for marker in markers[-1].markers} == {
+        *("stick", "joints", "flesh"), *("anna2/stick", "anna2/joints", "anna2/flesh")
+    }  # fmt: skip
+    graph.until(carvings.diagnostics.says("pose: posture of anna2", "tracking"))
+    assert status_values(carvings.diagnostics["pose: posture"])["people"] == "anna anna2"
+    carvings.send(components(hulls[-1])[0], len(hulls))
+    graph.until(lambda: len(markers) == len(hulls) + 1)
+    assert [m.ns for m in markers[-1].markers if m.action == Marker.DELETE] == [
+        "anna2/stick", "anna2/joints", "anna2/flesh"
+    ]  # fmt: skip
+
+
+def test_ids_count_on_from_the_first() -> None:
+    assert [body_id("p1", n) for n in (1, 2, 3)] == ["p1", "p2", "p3"]
+    assert [body_id("anna", n) for n in (1, 2)] == ["anna", "anna2"]
+    assert body_id("body9", 2) == "body10"
 
 
 # --- what only an apt ROS 2 has ---

@@ -14,6 +14,7 @@ from limbloc_ros.core.errors import ConfigError, InputError, RigError
 from limbloc_ros.core.pose import JOINT, JOINT_NAMES
 from limbloc_ros.simulation import _quaternions as quat
 from limbloc_ros.simulation import _render_kernels as kernels
+from limbloc_ros.simulation.company import chair, company
 from limbloc_ros.simulation.motion import PLAYLIST, Motion, motion_names
 from limbloc_ros.simulation.person import PERSON_NAMES, load_person
 from limbloc_ros.simulation.retarget import LINK, LINKS, Retarget
@@ -502,3 +503,68 @@ def test_the_person_stands_out_from_the_room_but_not_everywhere(name: str) -> No
     contrast = np.concatenate(contrasts)
     assert np.mean(contrast > 12) > 0.9
     assert np.mean(contrast <= 24) > 0.002
+
+
+# ---- several people ----
+
+
+def test_people_have_places_of_their_own_and_do_what_is_said() -> None:
+    pelvis = JOINT["pelvis_centre"]
+    for together, low, high in (("apart", 1.1, 2.2), ("crossing", 0.5, 1.0), ("touching", 0.35, 0.55)):
+        motions = company(3, together, empty_s=0.0)
+        assert [motion.person.name for motion in motions] == ["man", "woman", "child"]
+        nearest = np.inf
+        for t in np.arange(3.0, 27.0, 0.25):
+            places = [motion.pose(t).joints[pelvis, :2] for motion in motions]
+            nearest = min(
+                nearest, *(np.linalg.norm(a - b) for a, b in zip(places, [*places[1:], places[0]], strict=True))
+            )
+            assert np.abs(places).max() < 1.5
+        assert low < nearest < high
+    with pytest.raises(ConfigError, match="people: expected 1 to 4, got 5"):
+        company(5, "apart")
+    with pytest.raises(ConfigError, match="together: expected one of apart"):
+        company(2, "asunder")
+
+
+def test_each_of_several_people_is_drawn_where_the_truth_says_and_hides_who_is_behind() -> None:
+    rig = default_rig(4, 320, 240)
+    motions = company(2, "crossing", empty_s=0.0)
+    both, first, second = (
+        SimulatedRoom(rig, motions=who, noise_sigma=0.0, light_drift=0.0) for who in (motions, motions[:1], motions[1:])
+    )
+    t = 6.0
+    truth = both.everybodys_joints(t)
+    np.testing.assert_array_equal(truth[0], first.joints(t))
+    np.testing.assert_array_equal(truth[1], second.joints(t))
+    hidden = 0
+    for name in rig.names:
+        (image, mask), (image_1, mask_1), (image_2, mask_2) = (
+            r.render_with_mask(name, t) for r in (both, first, second)
+        )
+        np.testing.assert_array_equal(mask, mask_1 | mask_2)
+        overlap = cv2.erode(mask_1 & mask_2, np.ones((3, 3))) > 0
+        hidden += overlap.sum()
+        # what is seen there is the nearer one
+        if overlap.any():
+            nearest = int(np.argmin([rig.camera(name).world_to_image(joints)[1].mean() for joints in truth]))
+            unlike = [np.abs(image[overlap].astype(int) - other[overlap]).mean() for other in (image_1, image_2)]
+            assert unlike[nearest] < 12
+            assert unlike[nearest] < 0.6 * unlike[1 - nearest]
+    assert hidden > 0
+
+
+def test_a_chair_is_drawn_when_it_is_there_and_where_it_was_pushed() -> None:
+    rig = default_rig(4, 320, 240)
+    seat = chair([(2.0, 0.5, 0.0, 0.0), (4.0, 0.5, 0.0, 0.0), (6.0, -0.5, 0.0, 1.0)])
+    assert seat.at(1.9) is None
+    np.testing.assert_allclose(seat.at(5.0).mean(axis=0)[:2], [0.0, 0.0], atol=0.1)
+    a, b, c = (seat.vertices[seat.faces[:, k]] for k in range(3))
+    assert np.einsum("ij,ij->", a, np.cross(b, c)) > 0  # faces are counter-clockwise from outside
+    room = SimulatedRoom(rig, empty_s=60.0, things=[seat])
+    assert not room.render_with_mask("cam0", 1.0)[1].any()
+    mask = room.render_with_mask("cam0", 3.0)[1]
+    uv, _ = rig.camera("cam0").world_to_image(seat.at(3.0))
+    v, u = np.nonzero(mask)
+    np.testing.assert_allclose([u.min(), u.max(), v.min(), v.max()],
+                               [uv[:, 0].min(), uv[:, 0].max(), uv[:, 1].min(), uv[:, 1].max()], atol=2)  # fmt: skip
