@@ -41,6 +41,7 @@ setup(
         (SHARE, ["package.xml"]),
         (f"{SHARE}/launch", files("launch/*")),
         (f"{SHARE}/config", files("config/*")),
+        (f"{SHARE}/config/sros2", files("config/sros2/*")),
     ],
     python_requires=">=3.11",
     # Tests of core, bags, nodes and report were run at both ends: the lower one with Python 3.11 and what Ubuntu 24.04
@@ -67,7 +68,10 @@ setup(
             "ezc3d>=1.6.3,<2",
             "foxglove-sdk>=0.20,<0.31",
             "websockets>=13,<18",
+            "distributed>=2024.8,<2027",
         ],
+        "cluster": ["distributed>=2024.8,<2027"],  # many recordings on the machines of a Dask cluster
+        "fuzz": ["atheris>=3.0,<4"],  # make fuzz
         "export": ["ezc3d>=1.6.3,<2"],  # C3D; the other formats need nothing
         "foxglove": ["foxglove-sdk>=0.20,<0.31"],  # a live view in a browser
         "docs": ["mkdocs>=1.6,<2", "mkdocs-material>=9.6,<10", "mkdocstrings[python]>=1.0,<2"],

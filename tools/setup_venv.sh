@@ -58,7 +58,10 @@ fi
 
 say "setup: Python $version and ROS 2 $ros into $venv (about a minute, 400 MB, the first time)"
 "$python" -m venv "$venv"
-# One pip run resolves all of it together; -e, so that tests and demo run what stands in the source tree.
-"$venv/bin/python" -m pip install -qq --disable-pip-version-check -r "requirements/$ros.txt" -e '.[dev]'
+# Every file that pip takes must have a hash in the lock (tools/lock_requirements.sh). Then we ourselves: -e, so that
+# tests and demo run what stands in the source tree.
+pip=("$venv/bin/python" -m pip install -qq --disable-pip-version-check)
+"${pip[@]}" --require-hashes -r "requirements/$ros.lock"
+"${pip[@]}" --no-deps --no-build-isolation -e .
 "$venv/bin/python" -c 'import cv2, numba, rclpy' || die "the installed packages cannot be imported; remove $venv and try again"
 say "setup: done"
