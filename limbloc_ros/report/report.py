@@ -12,6 +12,7 @@ from limbloc_ros.core.files import write_bytes
 from limbloc_ros.report.compare import limb_angles
 from limbloc_ros.report.page import Section, Table, build_page
 from limbloc_ros.report.plots_motion import ranges_table
+from limbloc_ros.report.plots_people import people_table
 from limbloc_ros.report.run import RunData
 from limbloc_ros.report.samples import Sample
 from limbloc_ros.report.sections import comparison_pictures, run_pictures, sample_pictures
@@ -75,6 +76,10 @@ def _summary_section(run: RunData, samples: Sequence[Sample]) -> Section:
 
 def _closing_sections(run: RunData) -> list[Section]:
     found = []
+    people = people_table(run)
+    if people:
+        people_head = ("person", "frames", "reliable", "seen")
+        found.append(Section("people", "People", tables=[Table(people, people_head)]))
     errors = error_table(run)
     if errors:
         joint_head = ("joint", "mean (mm)", "median (mm)", "RMS (mm)", "95th percentile (mm)", "within 5 cm")

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from limbloc_ros import __version__
 from limbloc_ros.core.errors import InputError
 from limbloc_ros.core.pose import JOINT, JOINT_NAMES, STICK_BONES, Array
-from limbloc_ros.recordings.results import Run
+from limbloc_ros.recordings.results import Run, person_id
 
 #: The joints that the benchmark scores: the head and the limbs.
 LIMB_JOINTS = (
@@ -51,6 +51,8 @@ class RunData:
         truth_kind: `true` or `reference`, for captions.
         truth_about: what `truth` is and how it was matched, in words.
         truth_angles: joint angle -> [F] rad of the reference, where it has them.
+        people: id -> [F, 25, 3] joints of everybody, m, where there are several; all else is of one of them.
+        people_reliable: id -> bool [F].
     """
 
     title: str
@@ -71,6 +73,8 @@ class RunData:
     truth_kind: str = "true"
     truth_about: tuple[str, ...] = ()
     truth_angles: Mapping[str, Array] = field(default_factory=dict)
+    people: Mapping[str, Array] = field(default_factory=dict)
+    people_reliable: Mapping[str, NDArray[np.bool_]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         frames = len(self.joints)
@@ -119,6 +123,7 @@ class RunData:
         if truth:
             nothing = np.full((len(run), 3), np.nan)
             known = np.stack([np.asarray(truth.get(name, nothing), dtype=np.float64) for name in JOINT_NAMES], axis=1)
+        several = run.numbers if len(run.numbers) > 1 else ()
         stages = list(dict.fromkeys(stage for frame in run.frames for stage in frame.times))
         if consecutive is None:
             consecutive = about.get("consecutive")
@@ -141,6 +146,8 @@ class RunData:
             command=command or str(about.get("command", "")),
             version=str(about.get("version", __version__)),
             consecutive=consecutive,
+            people={person_id(n): run.of(n).joints for n in several},
+            people_reliable={person_id(n): run.of(n).reliable for n in several},
         )
 
     @property

@@ -12,7 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from limbloc_ros.core.errors import InputError
-from limbloc_ros.report import pictures, plots, plots_compare, plots_motion
+from limbloc_ros.report import pictures, plots, plots_compare, plots_motion, plots_people
 from limbloc_ros.report.compare import limb_angles
 from limbloc_ros.report.overlay import overlay_montage
 from limbloc_ros.report.run import RunData
@@ -105,6 +105,18 @@ def sample_pictures(run: RunData, samples: Sequence[Sample]) -> list[ReportPictu
 
 def run_pictures(run: RunData) -> list[ReportPicture]:
     found = []
+    if run.people:
+        found.append(
+            ReportPicture(
+                "everybody",
+                "Everybody",
+                "The paths of everybody's pelvis on the floor plan, and when each person was there: thick where the "
+                "pose was reliable. All other pictures are of the person who was followed longest at the time; the "
+                "folder people/ has a run for each, which can be reported alike.",
+                lambda: figure_png(plots_people.everybody(run)),
+                wide=True,
+            )
+        )
     if run.found.any():
         order = "consecutive frames" if run.consecutive else "unrelated frames"
         marks = " Jumps, steps far longer than usual, carry a cross; frames without a person are grey gaps."
