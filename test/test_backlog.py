@@ -6,12 +6,13 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 
+import numpy as np
 import pytest
 from ros_graph import Graph
 from std_msgs.msg import Header
 
 from limbloc_ros.ros import topics
-from limbloc_ros.ros.backlog import Backlog
+from limbloc_ros.ros.backlog import Backlog, Thinning
 from limbloc_ros.ros.messages import make_header, stamp_ns
 
 FRAME_NS = 100_000_000
@@ -88,3 +89,38 @@ def test_a_jump_back_in_time_is_not_mistaken_for_something_to_skip(graph: Graph)
     backlog.add(FRAME_NS, 1)
     graph.until(lambda: len(done) == 2)
     assert done == [0, 1]
+
+
+def instants(thinning: Thinning, first_s: float, last_s: float, rate_hz: float, late_s: float = 0.0) -> list[int]:
+    """Which of a camera's frames it takes, by number; its stamps are a little off."""
+    numbers = range(round(first_s * rate_hz), round(last_s * rate_hz))
+    return [n for n in numbers if thinning.takes(round((n / rate_hz + late_s) * 1e9))]
+
+
+def test_cameras_that_hear_the_same_take_the_same_instants() -> None:
+    cameras = [Thinning() for _ in range(3)]
+    assert instants(cameras[0], 0.0, 1.0, 60.0) == list(range(60))
+    for second in range(4):
+        for thinning in cameras:
+            for n in range(16):  # every camera announces it, again and again; that makes one step a second
+                thinning.announced(round((10 + 1.01 * second + n / 20) * 1e9))
+    assert {t.rate_hz for t in cameras} == {4.0}
+    taken = [instants(t, 14.0, 24.0, 60.0, late_s) for t, late_s in zip(cameras, (0.004, 0.005, 0.006), strict=True)]
+    assert taken[0] == taken[1] == taken[2]
+    assert len(taken[0]) == 40
+    assert np.diff(taken[0]).min() >= 14
+
+
+def test_thinning_ends_when_nobody_is_behind_any_more() -> None:
+    thinning = Thinning()
+    thinning.announced(0)
+    thinning.announced(round(2e9))
+    assert thinning.rate_hz == 16.0
+    assert len(instants(thinning, 2.0, 20.0, 30.0)) == pytest.approx(18 * 16, abs=2)
+    instants(thinning, 20.0, 23.0, 30.0)
+    assert thinning.rate_hz == 32.0
+    instants(thinning, 23.0, 44.0, 30.0)
+    assert instants(thinning, 44.0, 45.0, 60.0) == list(range(2640, 2700))
+    # A jump back in time also ends it, a step at a time.
+    thinning.announced(round(50e9))
+    assert instants(thinning, 0.0, 1.0, 60.0)[:2] == [0, 1]

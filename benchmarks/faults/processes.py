@@ -47,8 +47,11 @@ def footprint(pids: Mapping[str, int]) -> Footprint:
 
 
 def left_behind(segments: frozenset[str]) -> list[str]:
-    """Those of the shared memory files of DDS that still exist though no process uses them any more."""
-    there = {name for name in segments if "fast" in name and (SHARED / name).exists()}
+    """Those of the shared memory segments of DDS that still exist though no process uses them any more.
+
+    Its port files have numbers for names and are used again by whoever comes next: they do not count.
+    """
+    there = {n for n in segments if n.startswith("fast") and "_port" not in n and (SHARED / n).exists()}
     for process in Path("/proc").iterdir():
         if process.name.isdecimal() and there:
             try:

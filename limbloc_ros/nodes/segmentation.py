@@ -23,7 +23,7 @@ from limbloc_ros.core.images import Pixels
 from limbloc_ros.recordings.background_file import load_background, save_background
 from limbloc_ros.recordings.videos import pictures_in, read_picture
 from limbloc_ros.ros import image_messages, node_main, topics
-from limbloc_ros.ros.backlog import Backlog
+from limbloc_ros.ros.backlog import Backlog, Thinning
 from limbloc_ros.ros.health import WINDOW_S, Health, Meter
 from limbloc_ros.ros.messages import ERROR, NANOSECONDS, OK, WARN, make_header, make_status, stamp_ns
 from limbloc_ros.ros.parameters import NodeParameters
@@ -89,6 +89,7 @@ class SegmentationNode(Node):
         self.relit_s = -WINDOW_S
         self.meter = Meter()
         self.segment_ms = float("nan")
+        self.thinning = Thinning()
         self.backlog: Backlog[Image | CompressedImage] = Backlog(
             self, self.segment, self.settings.catch_up_s, self.tell_others
         )
@@ -110,7 +111,11 @@ class SegmentationNode(Node):
 
     def on_image(self, msg: Image | CompressedImage) -> None:
         """One image: into the backlog."""
-        self.backlog.add(stamp_ns(msg.header), msg)
+        stamp = stamp_ns(msg.header)
+        if self.thinning.takes(stamp):
+            self.backlog.add(stamp, msg)
+        else:
+            self.backlog.left_out()
 
     def tell_others(self, stamp: int) -> None:
         """We skipped our images up to this stamp (ns): without them the other cameras' are worth little."""
@@ -118,7 +123,9 @@ class SegmentationNode(Node):
 
     def on_skipped(self, msg: Header) -> None:
         """Another camera (or we) skipped its images up to this stamp."""
-        self.backlog.skip_until(stamp_ns(msg))
+        stamp = stamp_ns(msg)
+        self.thinning.announced(stamp)
+        self.backlog.skip_until(stamp)
 
     def segment(self, msg: Image | CompressedImage) -> None:
         """Segment one image, publish its mask with the image's stamp and frame."""
@@ -229,6 +236,8 @@ class SegmentationNode(Node):
             )
         if level == OK and self.backlog.behind:
             level, message = WARN, self.backlog.behind
+            if self.thinning.rate_hz < float("inf"):
+                message += f"; all cameras take {self.thinning.rate_hz:g} images a second at most"
         if self.meter.silence_s > SILENT_S:
             publishers = self.count_publishers(self.topic)
             why = "nobody publishes it" if publishers == 0 else f"{publishers} publisher(s), but no usable image came"

@@ -92,6 +92,10 @@ class Backlog(Generic[T]):
         self._count(len(self._items) - len(kept))
         self._items = deque(kept)
 
+    def left_out(self) -> None:
+        """An item was not even put by."""
+        self._count(1)
+
     def clear(self) -> None:
         """Forget what waits."""
         self._items.clear()
@@ -108,3 +112,44 @@ class Backlog(Generic[T]):
             self._work(item)
         if self._items:
             self._wake.reset()
+
+
+class Thinning:
+    """Which instants all cameras leave out while some camera's process cannot keep up.
+
+    Skipping what waits tears the sets when many cameras do it at different moments: each keeps other instants, and a
+    set wants all. So all agree on a rate: they hear the same announcements of skipped frames, and each one raises the
+    step, once a second at most; of every interval of the step only the first image is taken. All is counted by stamps,
+    which are the same for all cameras. After a while without announcements the step falls again.
+    """
+
+    #: Shortest interval, s; each step doubles it.
+    SHORTEST_S = 1 / 32
+    STEPS = 6
+    #: By stamps: between two steps up, and without announcements before a step down, s.
+    UP_S, DOWN_S = 1.0, 20.0
+
+    def __init__(self) -> None:
+        self._step = 0
+        self._stepped_ns = self._heard_ns = 0
+        self._interval = -1
+
+    @property
+    def rate_hz(self) -> float:
+        """Images a second that are taken at most; infinite when none is left out."""
+        return float("inf") if self._step == 0 else 1 / (self.SHORTEST_S * 2.0 ** (self._step - 1))
+
+    def announced(self, stamp_ns: int) -> None:
+        """Some camera skipped its frames up to this stamp."""
+        if self._step == 0 or abs(stamp_ns - self._stepped_ns) >= self.UP_S * NANOSECONDS:
+            self._step, self._stepped_ns = min(self._step + 1, self.STEPS), stamp_ns
+        self._heard_ns = stamp_ns
+
+    def takes(self, stamp_ns: int) -> bool:
+        """Whether an image is to be worked on."""
+        if self._step and abs(stamp_ns - self._heard_ns) > self.DOWN_S * NANOSECONDS:
+            self._step, self._heard_ns = self._step - 1, stamp_ns
+        if self._step == 0:
+            return True
+        before, self._interval = self._interval, int(stamp_ns * self.rate_hz) // NANOSECONDS
+        return self._interval != before
