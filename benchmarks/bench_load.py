@@ -31,8 +31,9 @@ from sensor_msgs.msg import CompressedImage
 from limbloc_ros.ros import topics
 from limbloc_ros.ros.messages import NANOSECONDS, make_header
 
-#: Catch-up times of segmentation, carving and pose, and one search for a lost figure, s.
-BOUND_S = 0.5 + 1.0 + 2.0 + 1.5
+#: Catch-up times of segmentation, carving and pose, the wait for the last mask of a set, and one search for a lost
+#: figure, s.
+BOUND_S = 0.5 + 1.0 + 2.0 + 1.0 + 1.5
 POSES = 4
 
 
@@ -83,6 +84,7 @@ def flood(cameras: int, width: int, height: int, rate_hz: float, seconds: float)
         if not live.start():
             print("not right for five poses running within 30 s", file=sys.stderr)
         live.spin(3.0)
+        sets = counted(live)
         before, first, sent, filmed = footprint(live.graph.pids), len(live.answers), driver.sent, len(driver.truth)
         began = time.monotonic()
         live.spin(seconds)
@@ -92,7 +94,7 @@ def flood(cameras: int, width: int, height: int, rate_hz: float, seconds: float)
         ages = np.array([a.at_s + offset_s - a.stamp_ns / NANOSECONDS for a in answers if a.posed])
         stamps = [a.stamp_ns for a in answers]
         after = footprint(live.graph.pids)
-        hull = live.values["carving: hull"]
+        sets = {key: value - sets[key] for key, value in counted(live).items()}
         slow = sorted({s.name for s in live.said if "too slow" in s.message})
     filmed = len(driver.truth) - filmed
     print(f"sent {(driver.sent - sent) / lasted:.0f} images a second, {filmed / lasted:.1f} instants of {rate_hz:g}")
@@ -101,7 +103,7 @@ def flood(cameras: int, width: int, height: int, rate_hz: float, seconds: float)
     if len(ages):
         low, middle, high, most = np.percentile(ages, (5, 50, 95, 100))
         print(f"age of a pose when it comes: 5 % {low:.2f} s, median {middle:.2f}, 95 % {high:.2f}, oldest {most:.2f}")
-    print("sets: " + ", ".join(f"{key} {hull[key]}" for key in hull if key.startswith("sets_")))
+    print("sets of masks: " + ", ".join(f"{value} {key}" for key, value in sets.items()))
     print(f"memory {before.rss_mb:.0f} -> {after.rss_mb:.0f} MB; too slow, say {', '.join(slow) or 'none'}")
     problems = []
     if not answers:
@@ -110,11 +112,17 @@ def flood(cameras: int, width: int, height: int, rate_hz: float, seconds: float)
         problems.append(f"a pose is {ages.max():.1f} s old, the queues allow {BOUND_S:g} s")
     if stamps != sorted(stamps):
         problems.append("answers come out of order")
-    if int(hull["sets_incomplete"]) > 0.2 * max(int(hull["sets_complete"]), 1):
+    if sets["incomplete"] + sets["dropped"] > max(sets["complete"], 1):
         problems.append("sets are torn: some cameras skip other instants than the rest")
     if len(answers) < 0.9 * filmed and not slow:
         problems.append("instants are lost and nobody says so")
     return problems
+
+
+def counted(live: Live) -> dict[str, int]:
+    """What carving says of its sets so far."""
+    values = live.values["carving: hull"]
+    return {key: int(values[f"sets_{key}"]) for key in ("complete", "incomplete", "dropped", "skipped")}
 
 
 def main() -> int:

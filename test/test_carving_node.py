@@ -17,6 +17,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.parameter import Parameter
 from ros_graph import Graph
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
+from std_msgs.msg import Header
 
 from limbloc_ros.core.camera import Rig
 from limbloc_ros.core.errors import ConfigError, InputError, NoPerson, RigError
@@ -242,6 +243,22 @@ def test_a_slow_machine_skips_whole_sets_and_carves_the_newest(
     carved = len(cameras.hulls)
     assert carved < 9
     graph.until(lambda: cameras.diagnostics.value("carving: hull", "sets_skipped") == str(9 - carved))
+
+
+def test_sets_wait_longer_while_a_camera_is_behind(graph: Graph, rig: Rig, rig_file: str, person: Masks) -> None:
+    graph.add(CarvingNode, rig_file=rig_file)
+    cameras = Cameras(graph, rig.names)
+    skips = graph.publisher(Header, topics.FRAMES_SKIPPED)
+    three = {name: person[name] for name in rig.names[:3]}
+    for n, complete in ((1, "0"), (2, "1")):
+        cameras.send(three, n)
+        graph.spin(0.4)
+        cameras.publishers["cam3"].publish(mask_to_compressed(person["cam3"], make_header(T0_NS + n * FRAME_NS, "")))
+        graph.until(lambda n=n: len(cameras.hulls) == n)
+        graph.spin(0.15)
+        assert cameras.diagnostics.value("carving: hull", "sets_complete") == complete
+        skips.publish(make_header(T0_NS + n * FRAME_NS, "cam3"))
+        graph.spin(0.1)
 
 
 def test_some_cameras_of_the_rig(graph: Graph, rig: Rig, rig_file: str, person: Masks) -> None:

@@ -32,6 +32,10 @@ from limbloc_ros.ros.rig_source import RigFromTopics, rig_from_file
 #: How often it is seen whether a set has waited long enough for its last cameras.
 TICK_S = 0.02
 
+#: While some camera's process is behind, masks of one instant come far apart: then sets wait this long for the rest, s,
+#: until nothing has been skipped for some seconds.
+BEHIND_TIMEOUT_S, BEHIND_S = 1.0, 10.0
+
 #: Once per process, however many nodes are composed in it.
 warm_up = functools.cache(Carver.warm_up)
 
@@ -69,6 +73,7 @@ class CarvingNode(Node):
         self.carver: Carver | None = None
         self.rig_source: RigFromTopics | None = None
         self.synchroniser: StampSynchroniser[Pixels] | None = None
+        self.skipped_s = -BEHIND_S
         warm_up()
         self.backlog: Backlog[FrameSet[Pixels]] = Backlog(self, self.carve, self.settings.catch_up_s)
         self.hull = self.create_publisher(PointCloud2, topics.HULL, topics.STREAM_QOS)
@@ -125,10 +130,14 @@ class CarvingNode(Node):
     def on_tick(self) -> None:
         """Let incomplete sets go when their time is up."""
         if self.synchroniser is not None:
+            behind = time.monotonic() - self.skipped_s < BEHIND_S
+            timeout_s = self.sync_config.timeout_s
+            self.synchroniser.timeout_s = max(timeout_s, BEHIND_TIMEOUT_S) if behind else timeout_s
             self.put_by(self.synchroniser.tick(time.monotonic_ns()))
 
     def on_skipped(self, msg: Header) -> None:
         """A camera's segmentation is behind and skipped its images up to this stamp, and so do the others."""
+        self.skipped_s = time.monotonic()
         if self.synchroniser is not None:
             self.synchroniser.skip_until(stamp_ns(msg))
 
@@ -164,7 +173,7 @@ class CarvingNode(Node):
 
     def _on_sync_config(self, config: SyncConfig) -> None:
         if self.synchroniser is not None:
-            self.synchroniser.slop_s, self.synchroniser.timeout_s = config.slop_s, config.timeout_s
+            self.synchroniser.slop_s = config.slop_s
         self.sync_config = config
 
 
