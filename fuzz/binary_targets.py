@@ -497,6 +497,7 @@ def _node() -> Any:
 @target("node_parameters", lambda: [bytes(range(200)), b"\5\0" * 60], most=300)
 def node_parameters(data: bytes) -> None:
     """Parameters of a running node, set to anything."""
+    from rclpy.exceptions import ParameterNotDeclaredException
     from rclpy.parameter import Parameter
 
     from limbloc_ros.core.config import validated
@@ -517,7 +518,10 @@ def node_parameters(data: bytes) -> None:
             *(Parameter.Type.DOUBLE_ARRAY, Parameter.Type.STRING_ARRAY, Parameter.Type.NOT_SET),
         )
         wanted.append(Parameter(name, types[kind], value))
-    results = node.set_parameters(wanted)
+    try:
+        results = node.set_parameters(wanted)
+    except ParameterNotDeclaredException as error:  # the node's service answers with a refusal
+        raise InputError(str(error)) from None
     for section in values.values():
         validated(section)
         assert all(math.isfinite(v) for v in vars(section).values() if isinstance(v, float))

@@ -19,6 +19,7 @@ COMMANDS = {
     "run": "start the smart space on your cameras",
     "rig": "import, calibrate, check and plan the cameras of a room",
     "process": "work out the poses of a recording: a bag, videos, image folders or a benchmark case",
+    "batch": "work out the poses of many recordings, here or on a Dask cluster",
     "replay": "play a bag into the running graph",
     "record": "record the running graph into a bag",
     "report": "make pictures and a page of a finished run",

@@ -17,6 +17,7 @@ from limbloc_ros.core.errors import ConfigError, InputError
 from limbloc_ros.recordings import offline
 from limbloc_ros.recordings.config_file import load_config
 from limbloc_ros.recordings.kept_frames import KeptFrames
+from limbloc_ros.recordings.offline import OfflineConfig
 from limbloc_ros.recordings.open_source import open_source
 from limbloc_ros.recordings.results import Run
 from limbloc_ros.rig.rig_file import load_rig, save_rig
@@ -51,6 +52,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("input", type=Path, metavar="INPUT", help="bag, folder of videos or images, or benchmark case")
     parser.add_argument("--rig", type=Path, help="rig YAML or calib.json with the calibrated cameras")
     parser.add_argument("--out", type=Path, help="folder for the results, or a .npz file (default: out/<INPUT's name>)")
+    parser.add_argument("--report", action="store_true", help="also make pictures and a page (OUT/report/report.html)")
+    add_options(parser)
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """What `limbloc batch` takes too."""
     parser.add_argument("--engine", choices=("robust", "paper"), help="which fitting chain runs (default: robust)")
     parser.add_argument(
         "--temporal",
@@ -59,7 +66,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="start each frame from the one before: faster and smoother, but one process",
     )
     parser.add_argument("--jobs", type=int, default=0, metavar="N", help="processes (default: one per core)")
-    parser.add_argument("--report", action="store_true", help="also make pictures and a page (OUT/report/report.html)")
     parser.add_argument("--config", type=Path, metavar="YAML", help="parameters, see docs/parameters.md")
     parser.add_argument(
         "--background",
@@ -79,17 +85,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--fps", type=float, metavar="HZ", help="frame rate of image folders (default: 25)")
 
 
-def run(args: argparse.Namespace) -> int:
-    """Do it."""
+def config_of(args: argparse.Namespace) -> OfflineConfig:
+    """The parameters file with the options on top; raises ConfigError."""
     config = load_config(args.config)
     chosen = {name: getattr(args, name) for name in ("engine", "temporal") if getattr(args, name) is not None}
-    config = dataclasses.replace(
-        config, fit=from_mapping(type(config.fit), {**dataclasses.asdict(config.fit), **chosen})
-    )
     if args.jobs < 0:
         raise ConfigError(f"--jobs: expected 1 or more (0: one per core), got {args.jobs}")
     if args.leave_out < 0:
         raise ConfigError(f"--leave-out: expected 0 or more frames, got {args.leave_out}")
+    fit = from_mapping(type(config.fit), {**dataclasses.asdict(config.fit), **chosen})
+    return dataclasses.replace(config, fit=fit)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Do it."""
+    config = config_of(args)
     source = open_source(
         args.input,
         load_rig(args.rig) if args.rig else None,
