@@ -15,7 +15,8 @@ from limbloc_ros.core.pose import Pose
 
 def random_state(rng: np.random.Generator, share: float = 1.0) -> FigureState:
     """A person of random size anywhere, facing anywhere, every joint within `share` of its limits."""
-    shape = np.concatenate([[rng.uniform(np.log(1.1), np.log(2.0))], rng.normal(0, 1, proportions().n_shape - 1)])
+    body = rng.uniform(np.log(1.1), np.log(2.0)), *rng.normal(0, 1, proportions().clothing_from - 1)
+    shape = np.array([*body, 0.5, 0.3])  # and clothes
     state = FigureState(rng.normal(0, 1, 3), energy.REST_ROTATIONS.copy(), shape)
     step = np.zeros(3 + N_DOF + len(shape))
     step[3 : 3 + N_DOF] = share * rng.uniform(energy.LOW, energy.HIGH)
@@ -28,8 +29,12 @@ def fitted_states() -> tuple[FigureState, ...]:
     with np.load(Path(__file__).parent / "data" / "figure_states.npz") as file:
         rows = file["states"].astype(np.float64)
     split = 3 + 3 * N_BONES
+    bare = np.zeros(proportions().n_shape - proportions().clothing_from)
     return tuple(
-        FigureState(row[:3], Rotation.from_rotvec(row[3:split].reshape(-1, 3)).as_matrix(), row[split:]) for row in rows
+        FigureState(
+            row[:3], Rotation.from_rotvec(row[3:split].reshape(-1, 3)).as_matrix(), np.concatenate([row[split:], bare])
+        )
+        for row in rows
     )
 
 

@@ -13,7 +13,9 @@ from limbloc_ros.core.figure import BONE, FigureState, place
 from limbloc_ros.core.hull import Hull
 from limbloc_ros.core.pose import Flesh
 
-NOTHING = Weights(surface=0.0, inclusion=0.0, penetration=0.0, posture=0.0, limits=0.0, spine=0.0, proportions=0.0)
+NOTHING = Weights(
+    surface=0.0, inclusion=0.0, penetration=0.0, posture=0.0, limits=0.0, spine=0.0, proportions=0.0, clothing=0.0
+)
 VOXEL = 0.02
 
 
@@ -170,6 +172,20 @@ def test_gradient_of_a_posture_term_points_uphill(name):
         numeric = finite_difference(state, BARE, weights)
         gradient = 2 * energy.system(state, BARE, weights).gradient
         assert gradient @ numeric > 0.4 * np.linalg.norm(gradient) * np.linalg.norm(numeric)
+
+
+def test_clothes_add_to_a_body_and_do_not_take_away():
+    first = figure.proportions().clothing_from
+    state = FigureState.standing(np.zeros(3), stature=1.7)
+    for amount, expected in ((0.5, 0.25), (2.0, 4.0), (-2.0, 25.0 * 4.0)):
+        state.shape[first] = amount
+        found = energy.system(state, BARE, only(clothing=1.0))
+        assert found.cost == pytest.approx(expected)
+        at = 3 + figure.N_DOF + first
+        assert 2.0 * found.gradient[at] == pytest.approx(finite_difference(state, BARE, only(clothing=1.0))[at])
+        assert energy.system(state, BARE, only(proportions=1.0)).cost == pytest.approx(
+            energy.system(FigureState.standing(np.zeros(3), stature=1.7), BARE, only(proportions=1.0)).cost
+        )
 
 
 def test_gradient_of_everything_but_posture(case):
@@ -460,7 +476,7 @@ def test_an_even_spine_costs_nothing():
 def test_mean_people_have_the_likeliest_size():
     table = figure.proportions()
     state = FigureState.standing(np.zeros(3), stature=float(np.exp(table.log_stature_mean)))
-    proportions = only(proportions=1.0)
+    proportions = only(proportions=1.0, clothing=1.0)
     assert energy.system(state, BARE, proportions).cost == pytest.approx(0.0, abs=1e-20)
     state.shape[1:] = 1.0
     state.shape[0] += table.log_stature_std

@@ -10,6 +10,7 @@ from flesh_hulls import POSTURES, person_in
 
 from limbloc_ros.core import energy, figure, limb_pairs, search
 from limbloc_ros.core.energy import Evidence, Weights
+from limbloc_ros.core.engine_robust import SEARCH_WEIGHTS
 from limbloc_ros.core.figure import BONE, place
 from limbloc_ros.core.joint_angles import native_angles
 from limbloc_ros.core.limb_pairs import kernels, with_limb
@@ -243,7 +244,7 @@ def costs_of_pairs(person, kind, limbs, evidence, weights):
     return np.array(mine), np.array(whole)
 
 
-BENT = Weights(penetration=0.0, posture=0.0, limits=0.0, spine=0.0)
+BENT = Weights(**SEARCH_WEIGHTS, penetration=0.0, posture=0.0, limits=0.0, spine=0.0)
 
 
 @KINDS

@@ -16,6 +16,9 @@ from numba import njit
 from limbloc_ros.core._figure_kernels import log_so3, part_bounds, part_distance
 from limbloc_ros.core._surface_fit_kernels import add_block, robust_weight
 
+#: How much more a negative amount of clothing costs than a positive one.
+TIGHT = 25.0
+
 
 @njit(cache=True, inline="always", error_model="numpy")  # type: ignore[misc, unused-ignore]
 def sample_sdf(sdf: Any, origin: Any, voxel: float, x: float, y: float, z: float, out: Any) -> float:
@@ -261,6 +264,8 @@ def posture_term(
     smooth_pairs: Any,
     smooth_weight: float,
     shape_weight: float,
+    clothing_weight: float,
+    clothing_from: int,
     log_stature: float,
     log_stature_std: float,
     A: Any,
@@ -269,7 +274,7 @@ def posture_term(
     """Joint limits (constraint 4), a weak pull to the middle of the range, an even spine, human proportions.
 
     `rest`, `low`, `high`, `spread` belong to the degrees of freedom; the angle of one is the component of the
-    rotation vector from the bone's rest rotation `rest` [B, 3, 3] along its axis.
+    rotation vector from the bone's rest rotation `rest` [B, 3, 3] along its axis. `shape[clothing_from:]` is clothing.
     """
     cost = 0.0
     nb = len(rotations)
@@ -335,9 +340,11 @@ def posture_term(
     A[first, first] += shape_weight / (log_stature_std * log_stature_std)
     g[first] += shape_weight * e / log_stature_std
     for k in range(1, len(shape)):
-        cost += shape_weight * shape[k] * shape[k]
-        A[first + k, first + k] += shape_weight
-        g[first + k] += shape_weight * shape[k]
+        # clothes add to a body and never take away
+        weight = shape_weight if k < clothing_from else clothing_weight * (TIGHT if shape[k] < 0.0 else 1.0)
+        cost += weight * shape[k] * shape[k]
+        A[first + k, first + k] += weight
+        g[first + k] += weight * shape[k]
     return cost  # type: ignore[no-any-return]
 
 

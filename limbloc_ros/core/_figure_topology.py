@@ -158,3 +158,30 @@ PARTS: list[tuple[str, tuple[str, ...]]] = [
         ]
     ),
 ]
+
+#: What loose clothes add to radii, m for a stature of 1.75 m, per unit of that kind of clothing; both sides alike.
+CLOTHING: dict[str, dict[str, float]] = {
+    "upper": {
+        "iliac": 0.0175,
+        "belly": 0.0175,
+        "waist": 0.0175,
+        "ribs": 0.0175,
+        "chest": 0.0175,
+        "back": 0.0175,
+        "upper_chest": 0.014,
+        "shoulder": 0.014,
+        "deltoid": 0.014,
+        "biceps": 0.014,
+        "elbow": 0.01,
+        "bulge": 0.01,
+    },
+    "lower": {
+        "iliac": 0.01,
+        "hip": 0.0175,
+        "glute": 0.0175,
+        "thigh_top": 0.021,
+        "thigh_mid": 0.026,
+        "knee": 0.026,
+        "calf": 0.014,
+    },
+}

@@ -28,10 +28,10 @@ class Weights:
     """
 
     surface: float = 1.0
-    surface_width_m: float = 0.06
+    surface_width_m: float = 0.03
     surface_inside: float = 2.0
     normal_gate_m: float = 0.10
-    inclusion: float = 0.006
+    inclusion: float = 0.002
     inclusion_width_m: float = 0.06
     inclusion_slack_m: float = 0.002
     penetration: float = 0.01
@@ -41,6 +41,7 @@ class Weights:
     limits: float = 2e-2
     spine: float = 2e-4
     proportions: float = 4e-6
+    clothing: float = 4e-6
 
 
 @dataclass(frozen=True)
@@ -252,6 +253,8 @@ def system(state: FigureState, evidence: Evidence, weights: Weights) -> System:
         SPINE_PAIRS,
         w.spine,
         w.proportions,
+        w.clothing,
+        table.clothing_from,
         table.log_stature_mean,
         table.log_stature_std,
         A,

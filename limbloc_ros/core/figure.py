@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from limbloc_ros.core import _figure_kernels as kernels
-from limbloc_ros.core._figure_topology import BONES, JOINT_BONES, PARTS, SPHERES
+from limbloc_ros.core._figure_topology import BONES, CLOTHING, JOINT_BONES, PARTS, SPHERES
 from limbloc_ros.core.pose import JOINT_NAMES, Flesh
 
 Array = NDArray[np.float64]
@@ -27,6 +27,9 @@ BONE = {name: index for index, name in enumerate(BONE_NAMES)}
 SPHERE_NAMES: tuple[str, ...] = tuple(row[0] for row in SPHERES)
 SPHERE = {name: index for index, name in enumerate(SPHERE_NAMES)}
 PART_NAMES: tuple[str, ...] = tuple(name for name, _ in PARTS)
+
+#: The stature for which the topology gives lengths in metres.
+REFERENCE_STATURE_M = 1.75
 
 N_BONES, N_SPHERES, N_PARTS = len(BONES), len(SPHERES), len(PARTS)
 
@@ -76,6 +79,11 @@ class Proportions:
         """Length of the shape vector."""
         return int(self.bone_offsets.shape[2])
 
+    @property
+    def clothing_from(self) -> int:
+        """Index in the shape vector from which it is clothing, not the body."""
+        return self.n_shape - len(CLOTHING)
+
 
 @cache
 def proportions() -> Proportions:
@@ -88,14 +96,28 @@ def proportions() -> Proportions:
         offsets = np.concatenate([table["sphere_centres"], joints])
         radii = np.concatenate([table["sphere_radii"], np.zeros((len(order), joints.shape[2]))])
         mean, std = (float(value) for value in table["log_stature"])
+        clothing = np.zeros((len(radii), len(CLOTHING)))
+        clothing[: len(SPHERES)] = _clothing_radii()
         return Proportions(
-            table["bone_offsets"].astype(np.float64),
+            _with_modes(table["bone_offsets"]),
             np.array(bones, np.int64),
-            offsets.astype(np.float64),
-            radii.astype(np.float64),
+            _with_modes(offsets),
+            np.concatenate([radii, clothing], axis=-1),
             mean,
             std,
         )
+
+
+def _with_modes(lengths: Array) -> Array:
+    """Lengths that clothing does not change."""
+    return np.concatenate([lengths, np.zeros((*lengths.shape[:-1], len(CLOTHING)))], axis=-1)
+
+
+def _clothing_radii() -> Array:
+    """[S, clothes] what clothes add to the spheres' radii, in units of the stature."""
+    either_side = [name.removesuffix("_L").removesuffix("_R") for name in SPHERE_NAMES]
+    added = [[clothes.get(name, 0.0) for clothes in CLOTHING.values()] for name in either_side]
+    return np.array(added) / REFERENCE_STATURE_M
 
 
 @dataclass(frozen=True)
@@ -105,7 +127,8 @@ class FigureState:
     Attributes:
         root: [3] pelvis centre in the world, m.
         rotations: [B, 3, 3] of each bone in its parent (the pelvis in the world).
-        shape: [1 + K] log of the stature in m, then the weights of the shape modes (standard deviations).
+        shape: [1 + K] log of the stature in m, then the weights of the shape modes (standard deviations), then how
+            much loose clothing of each kind is worn.
     """
 
     root: Array
