@@ -191,6 +191,10 @@ class CarvingReport:
         said = f"missing in {min(100.0 * missing / sets, 100.0):.0f} % of the sets of the last seconds"
         if counters.duplicate[camera] - before.duplicate.get(camera, 0) > MISSING_SHARE * sets:
             return f"{said}: it sends the same stamps again and again"
+        came = {c: counters.received[c] - before.received.get(c, 0) for c in self._topics}
+        usual = statistics.median(came.values())
+        if came[camera] < (1 - MISSING_SHARE) * usual:
+            return f"{said}: {came[camera]} masks of it came, {usual:.0f} of the other cameras"
         own, others = self._masks[camera], [m for c, m in self._masks.items() if c != camera and m.count]
         older_s = (own.latency_ms - statistics.median(m.latency_ms for m in others)) / 1e3 if others else 0.0
         if abs(older_s) > OFF_S:
@@ -199,9 +203,6 @@ class CarvingReport:
                 f"{said}: on arrival its stamps are {1e3 * abs(older_s):.0f} ms {how} than the other cameras': it is "
                 f"{'late, or ' if older_s > 0 else ''}its clock is off"
             )
-        rate = statistics.median(m.rate_hz for m in others) if others else 0.0
-        if own.rate_hz < (1 - MISSING_SHARE) * rate:
-            return f"{said}: {own.rate_hz:.1f} masks a second, the other cameras {rate:.1f}"
         if counters.late[camera] - before.late.get(camera, 0) > MISSING_SHARE * sets:
             return f"{said}: its masks come out of order, or when their set has left"
         return f"{said}: its stamps are not those of the other cameras"
