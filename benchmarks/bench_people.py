@@ -158,6 +158,7 @@ def score_live(people: int, together: str, args: argparse.Namespace) -> tuple[Sc
         config=None, source="simulated", rig=None, bag=None, cameras=None, record=None, foxglove=None,
         set=[
             f"simulated_cameras.rate_hz={float(args.live_rate)}", f"simulated_cameras.number_of_cameras={args.cameras}",
+            f"simulated_cameras.width={args.live_width}", f"simulated_cameras.height={args.live_width * 3 // 4}",
             f"simulated_cameras.people={people}", f"simulated_cameras.together={together}",
             "pose.fit.temporal=true", f"network.domain_id={1 + os.getpid() % 100}",
         ],
@@ -224,6 +225,7 @@ def main() -> int:
     parser.add_argument("--alone", action="store_true", help="fit every frame alone")
     parser.add_argument("--live", type=float, default=0.0, metavar="S", help="also run the graph for so long")
     parser.add_argument("--live-rate", type=float, default=8.0, metavar="HZ", help="images a second of each camera")
+    parser.add_argument("--live-width", type=int, default=640, metavar="PX", help="of the images, which are 4:3")
     parser.add_argument("--scene", action="append", help="only scenes with this in their names; may be repeated")
     args = parser.parse_args()
     offline.prepare(print)

@@ -156,7 +156,7 @@ class _Track:
 
     def rests(self, stamp_ns: int) -> bool:
         """Furniture need not be looked at in every frame."""
-        if self.number or self.score > FURNITURE or self.looked_ns is None:
+        if self.looked_ns is None:
             return False
         return (stamp_ns - self.looked_ns) * 1e-9 < (HASTE_S if self._changed() else self.rest_s)
 
@@ -247,6 +247,7 @@ class People:
 
     def _follow_many(self, sight: Sight, stamp_ns: int) -> list[_Track]:
         taken: list[_Track] = []
+        newcomers: list[tuple[_Track, int]] = []
         found = self._assign(sight.parts, stamp_ns)
         for n, part in enumerate(sight.parts):
             claimants = [track for track, m in found if m == n]
@@ -261,11 +262,11 @@ class People:
                 track.see(part, stamp_ns, shared=False)
                 if self._alone is None and not any(other.number for other in self._tracks):
                     self._alone = track  # the largest part in a room in which nobody is known
-                if track is self._alone or not track.rests(stamp_ns):
-                    if track is not self._alone and track.score == FURNITURE and not track.number:
-                        track.estimator.reset()  # what has led astray is of no use
-                    track.judge(stamp_ns, sight.fit(n, track.estimator))
                 taken.append(track)
+                if track is self._alone or track.number or (track.looked_ns is not None and track.score > FURNITURE):
+                    track.judge(stamp_ns, sight.fit(n, track.estimator))
+                elif not track.rests(stamp_ns):
+                    newcomers.append((track, n))
                 continue
             pieces = divide(sight.hulls()[n], [_distance(track, stamp_ns) for track in claimants])
             for track, piece in zip(claimants, pieces, strict=True):
@@ -277,6 +278,11 @@ class People:
                     continue
                 track.see(Part.of(piece), stamp_ns, shared=True)
                 track.judge(stamp_ns, track.estimator.estimate(piece))
+        # Fits from scratch take as long as many followed frames: one newcomer in each frame, who has waited longest.
+        newcomers.sort(key=lambda entry: entry[0].looked_ns or 0)
+        for track, n in newcomers[: 1 if self.config.temporal else None]:
+            track.estimator.reset()  # what has led astray is of no use
+            track.judge(stamp_ns, sight.fit(n, track.estimator))
         return taken
 
     def _begin(self, part: Part, stamp_ns: int) -> _Track:
