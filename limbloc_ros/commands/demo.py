@@ -28,6 +28,7 @@ EPILOG = """\
 examples:
   limbloc demo
   limbloc demo --seconds 10 --cameras 4 --person child
+  limbloc demo --people 3 --together crossing
   limbloc demo --domain 42        and beside it: ROS_DOMAIN_ID=42 rviz2 -d config/limbloc.rviz
 """
 
@@ -43,6 +44,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--cameras", type=int, default=8, metavar="N", help="2 to 16 (default: 8)")
     parser.add_argument("--rate", type=float, default=10.0, metavar="HZ", help="images per second (default: 10)")
     parser.add_argument("--person", choices=("man", "woman", "child", "heavy"), default="man", help="who moves")
+    parser.add_argument("--people", type=int, default=1, metavar="N", help="how many, 1 to 4 (default: 1)")
+    parser.add_argument(
+        "--together",
+        choices=("apart", "crossing", "touching"),
+        default="apart",
+        help="what several people do (default: apart)",
+    )
     parser.add_argument("--out", type=Path, help="folder for the results (default: out/demo-<date>)")
     parser.add_argument("--domain", type=int, metavar="ID", help="ROS_DOMAIN_ID (default: the shell's, or a free one)")
     parser.add_argument(
@@ -83,6 +91,8 @@ def _run_live(args: argparse.Namespace, out: Path) -> None:
     settings = [
         f"simulated_cameras.rate_hz={float(args.rate)}",
         f"simulated_cameras.person={args.person}",
+        f"simulated_cameras.people={args.people}",
+        f"simulated_cameras.together={args.together}",
         "record.images=none",  # eight raw cameras fill 70 MB a second; the masks are what the poses come from
         "pose.fit.temporal=true",  # a figure fitted from scratch takes longer than the time between two images
         f"network.domain_id={_domain(args.domain)}",
