@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from limbloc_ros.core import figure
+from limbloc_ros.core import _figure_topology, figure
 from limbloc_ros.core.figure import BONE, SPHERE, FigureState, kernels, place, place_jacobian
 from limbloc_ros.core.pose import JOINT, JOINT_NAMES, STICK_BONES, Flesh
 
@@ -259,6 +259,23 @@ def test_clothes_make_the_flesh_wider_and_leave_the_skeleton():
     assert added["knee_R"] == pytest.approx(0.026)  # of a skirt
     assert added["iliac_L"] == pytest.approx(0.0175 + 0.01)  # under both
     assert {name for name, more in added.items() if more == 0.0} >= {"cranium", "tips_L", "toe_R", "ankle_L"}
+
+
+def test_shifted_pivots_leave_the_flesh_of_a_straight_person_in_place(monkeypatch):
+    state = FigureState.standing(np.zeros(3), stature=1.75)
+    shifted = place(state)
+    monkeypatch.setattr(figure, "PIVOT_SHIFTS", {})
+    monkeypatch.setattr(figure, "JOINT_SHIFTS", {})
+    monkeypatch.setattr(figure, "proportions", figure.proportions.__wrapped__)
+    plain = place(state)
+    np.testing.assert_allclose(shifted.spheres, plain.spheres, atol=1e-12)
+    moved = shifted.joints - plain.joints
+    for name in ("knee_L", "knee_R", "elbow_L"):
+        bone = {"knee": "shin", "elbow": "forearm"}[name[:-2]] + name[-2:]
+        np.testing.assert_allclose(moved[JOINT[name]], _figure_topology.PIVOT_SHIFTS[bone], atol=1e-12)
+    np.testing.assert_allclose(moved[JOINT["toe_R"]], [0.003, -0.008, -0.015], atol=1e-12)
+    for name in ("hip_L", "shoulder_R", "pelvis_centre"):
+        np.testing.assert_allclose(moved[JOINT[name]], 0.0, atol=1e-12)
 
 
 def test_the_standard_people_run_from_children_to_adults():

@@ -17,7 +17,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from limbloc_ros.core import _figure_kernels as kernels
-from limbloc_ros.core._figure_topology import BONES, CLOTHING, JOINT_BONES, PARTS, SPHERES
+from limbloc_ros.core._figure_topology import (
+    BONES,
+    CLOTHING,
+    JOINT_BONES,
+    JOINT_SHIFTS,
+    PARTS,
+    PIVOT_SHIFTS,
+    SPHERES,
+)
 from limbloc_ros.core.pose import JOINT_NAMES, Flesh
 
 Array = NDArray[np.float64]
@@ -93,19 +101,35 @@ def proportions() -> Proportions:
         order = [list(table["joint_names"]).index(name) for name in JOINT_NAMES]
         bones = [BONE[row[1]] for row in SPHERES] + [BONE[JOINT_BONES[name]] for name in JOINT_NAMES]
         joints = table["joint_offsets"][order]
-        offsets = np.concatenate([table["sphere_centres"], joints])
+        offsets = np.concatenate([table["sphere_centres"], joints]).astype(np.float64)
         radii = np.concatenate([table["sphere_radii"], np.zeros((len(order), joints.shape[2]))])
         mean, std = (float(value) for value in table["log_stature"])
         clothing = np.zeros((len(radii), len(CLOTHING)))
         clothing[: len(SPHERES)] = _clothing_radii()
+        origins = table["bone_offsets"].astype(np.float64)
+        _shift_joints(origins, bones, offsets)
         return Proportions(
-            _with_modes(table["bone_offsets"]),
+            _with_modes(origins),
             np.array(bones, np.int64),
             _with_modes(offsets),
             np.concatenate([radii, clothing], axis=-1),
             mean,
             std,
         )
+
+
+def _shift_joints(bone_offsets: Array, point_bones: list[int], point_offsets: Array) -> None:
+    """Move pivots and joints as the topology says, in place; flesh stays where it is while nothing is bent."""
+    for name, shift in PIVOT_SHIFTS.items():
+        d = np.array(shift) / REFERENCE_STATURE_M
+        bone_offsets[BONE[name], :, 0] += d
+        bone_offsets[[child for child in range(N_BONES) if PARENTS[child] == BONE[name]], :, 0] -= d
+        for n, bone in enumerate(point_bones):
+            marks_pivot = n >= N_SPHERES and not point_offsets[n].any()
+            if bone == BONE[name] and not marks_pivot:
+                point_offsets[n, :, 0] -= d
+    for name, shift in JOINT_SHIFTS.items():
+        point_offsets[N_SPHERES + JOINT_NAMES.index(name), :, 0] += np.array(shift) / REFERENCE_STATURE_M
 
 
 def _with_modes(lengths: Array) -> Array:
