@@ -267,7 +267,7 @@ def save_frames(frames: Sequence[FrameResult], path: Path) -> None:
         arrays |= {
             "bone_names": np.array(first.bone_names),
             "angle_names": np.array(list(first.angles)),
-            "size_names": np.array(list(first.sizes)),
+            "size_names": np.array(list(first.sizes), dtype=str),
             "pose_stage_names": np.array(_union(tuple(p.stage_ms) for p in poses), dtype=np.str_),
             "flesh_parts": first.flesh.parts,
             "flesh_part_names": np.array(first.flesh.part_names),
