@@ -59,7 +59,7 @@ def test_the_executable_that_it_starts_is_installed():
 
 def test_the_launch_file_and_config_are_found_where_they_are():
     assert share_folder() == ROOT
-    for name in ("smart_space.yaml", "fastdds.xml", "limbloc.rviz", "rig_example.yaml"):
+    for name in ("smart_space.yaml", "fastdds.xml", "fastdds_localhost.xml", "limbloc.rviz", "rig_example.yaml"):
         assert (CONFIG / name).is_file()
 
 
@@ -93,9 +93,10 @@ def test_the_rig_example_is_a_rig_whose_cameras_see_the_volume():
         assert 0 <= uv[0] < camera.width and 0 <= uv[1] < camera.height
 
 
-def test_the_dds_profile_is_the_default_one_with_large_segments():
+@pytest.mark.parametrize("name", ["fastdds.xml", "fastdds_localhost.xml"])
+def test_the_dds_profile_is_the_default_one_with_large_segments(name):
     space = {"d": "http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles"}
-    root = ET.parse(CONFIG / "fastdds.xml").getroot()
+    root = ET.parse(CONFIG / name).getroot()
     shared = [t for t in root.iterfind(".//d:transport_descriptor", space) if t.findtext("d:type", "", space) == "SHM"]
     assert int(shared[0].findtext("d:segment_size", "0", space)) == 16 * 2**20
     assert int(shared[0].findtext("d:maxMessageSize", "0", space)) == 4 * 2**20

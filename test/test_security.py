@@ -2,7 +2,11 @@
 """Least privilege on a real graph, nothing beyond this machine by default, and no code out of data."""
 
 import ast
+import os
 import socket
+import subprocess
+import sys
+import textwrap
 import xml.etree.ElementTree as ET
 from fnmatch import fnmatchcase
 from functools import cache
@@ -136,6 +140,41 @@ def test_defaults_stay_on_this_machine(tmp_path):
     installed = load_config(ROOT / "config" / "smart_space.yaml")
     assert installed.network == NetworkConfig()
     assert installed.foxglove_bridge["host"] == "127.0.0.1"
+
+
+def udp_sockets(environment):
+    """Addresses and ports of the UDP sockets of a process with one ROS node."""
+    script = """
+        import os, re
+        from pathlib import Path
+        import rclpy
+        from rclpy.node import Node
+        rclpy.init(domain_id=int(os.environ["ROS_DOMAIN_ID"]))
+        node = Node("lonely")
+        fds = [Path("/proc/self/fd", fd) for fd in os.listdir("/proc/self/fd")]
+        links = [os.readlink(fd) for fd in fds if fd.is_symlink()]
+        own = set(re.findall(r"socket:.(\\d+)", " ".join(links)))
+        for line in Path("/proc/net/udp").read_text().splitlines()[1:]:
+            if line.split()[9] in own:
+                print(line.split()[1])
+    """
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(script)], env={**os.environ, **environment},
+        capture_output=True, text=True, timeout=60, check=True,
+    )  # fmt: skip
+    return [
+        (socket.inet_ntoa(bytes.fromhex(a)[::-1]), int(p, 16)) for a, p in (x.split(":") for x in done.stdout.split())
+    ]
+
+
+def test_a_process_of_the_smart_space_hears_this_machine_only():
+    """Its sockets on DDS's own ports, 7400 to 7400 + 250 * 233, are bound to the loopback interface."""
+    environment = {**graph_environment(NetworkConfig(), {}), "ROS_DOMAIN_ID": "101"}
+    known = [address for address, port in udp_sockets(environment) if 7000 <= port < 32768]
+    assert len(known) >= 2
+    assert set(known) == {"127.0.0.1"}
+    open_to_all = udp_sockets({**environment, **graph_environment(NetworkConfig(discovery="subnet"), {})})
+    assert "0.0.0.0" in {address for address, port in open_to_all if 7000 <= port < 32768}
 
 
 def listening_addresses(port):

@@ -206,7 +206,7 @@ def test_the_command_line_prints_errors_without_a_trace(capsys, tmp_path):
 def test_environment_for_large_images():
     added = graph_environment(NetworkConfig(domain_id=5), base={"HOME": "/nowhere", "OMP_NUM_THREADS": "3"})
     for name in ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE"):
-        assert added[name] == str(config_file("fastdds.xml"))
+        assert added[name] == str(config_file("fastdds_localhost.xml"))
     assert added["ROS_AUTOMATIC_DISCOVERY_RANGE"] == "LOCALHOST"
     assert added["ROS_DOMAIN_ID"] == "5"
     assert int(added["MALLOC_MMAP_THRESHOLD_"]) == 67108864

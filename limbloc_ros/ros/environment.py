@@ -84,7 +84,8 @@ def graph_environment(network: NetworkConfig, base: Mapping[str, str] | None = N
         wanted["NUMBA_CACHE_DIR"] = str(_cache_folder(base) / "numba")
     forced: dict[str, str] = {}
     if network.dds_profile != "none":
-        profile = Path(network.dds_profile) if network.dds_profile else config_file("fastdds.xml")
+        ours = "fastdds_localhost.xml" if network.discovery == "localhost" else "fastdds.xml"
+        profile = Path(network.dds_profile) if network.dds_profile else config_file(ours)
         if not profile.is_file():
             raise ConfigError(f"network.dds_profile: expected a Fast DDS profile file, {profile} is none")
         # Jazzy reads the second, later versions the first.
