@@ -148,6 +148,21 @@ def test_an_archive_that_claims_a_billion_numbers_takes_no_memory(tmp_path):
     assert "its header claims [1000000000] float64, but 32 bytes are there" in said
 
 
+def test_a_bag_whose_record_claims_a_gigabyte_takes_no_memory():
+    said = limited(
+        """
+        import shutil, tempfile
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "bag.mcap"
+            shutil.copy(sys.argv[1], path)
+            with BagReader(path) as bag:
+                print(bag.damage)
+        """,
+        CORPUS / "bag_mcap" / "length_of_1_GB",
+    )
+    assert "breaks off within the record" in said
+
+
 def test_a_zip_bomb_is_refused_before_it_unpacks(tmp_path, monkeypatch):
     path = tmp_path / "bomb.npz"
     path.write_bytes(packed_npz(a=np.zeros(1_000_000)))

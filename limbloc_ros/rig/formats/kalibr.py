@@ -65,7 +65,7 @@ def _camera(name: str, entry: Mapping[str, Any], T: np.ndarray[Any, Any], at: st
     if model != "pinhole":
         raise RigError(f"{at}: expected camera_model pinhole, got {kind(model)}; use pinhole-radtan or -equi")
     lens = entry.get("distortion_model", "none")
-    if lens not in _MODELS:
+    if not isinstance(lens, str) or lens not in _MODELS:
         raise RigError(f"{at}: expected distortion_model {', '.join(_MODELS)}, got {kind(lens)}")
     fu, fv, pu, pv = numbers(required(entry, "intrinsics", at), (4,), f"{at}: key intrinsics")
     coefficients = numbers(entry.get("distortion_coeffs", []), None, f"{at}: key distortion_coeffs")
