@@ -452,6 +452,24 @@ class TestScenes:
         assert (model.relit, result.light_jump) == (2, False)
         assert np.count_nonzero(result.mask) == pytest.approx(800, rel=0.1)
 
+    def test_a_lamp_that_lights_a_part_of_the_room_is_followed_and_who_comes_close_is_not_learned(self):
+        rng = np.random.default_rng(8)
+        picture = textured(rng) * 0.8
+        model = BackgroundModel(BackgroundConfig(learning_frames=5))
+        for _ in range(6):
+            model.segment(noisy(rng, picture))
+        x = np.linspace(0, 1, WIDTH)[None, :, None]
+        lit = picture * (1 + 0.8 * x**3)
+        for _ in range(PATIENCE):
+            result = model.segment(noisy(rng, lit))
+        assert (model.relit, result.learning, result.foreground_fraction < 0.02) == (1, False, True)
+        close = lit.copy()
+        close[:, 40:75] = (30, 160, 60)  # more than a quarter of the image, at once
+        for _ in range(PATIENCE + 3):
+            result = model.segment(noisy(rng, close))
+        assert result.foreground_fraction == pytest.approx(35 / WIDTH, rel=0.1)
+        assert not model.segment(noisy(rng, lit)).mask.any()
+
     def test_a_moved_camera_gives_no_mask_until_it_is_back(self):
         rng = np.random.default_rng(6)
         picture = textured(rng)

@@ -34,6 +34,7 @@ CORE_ORDER = (
     "images",
     "synchroniser",
     "mask_cleaning",
+    "segmentation",
     "relight",
     "background_estimate",
     "background",

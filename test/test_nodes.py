@@ -18,8 +18,8 @@ from ros_graph import Graph
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_srvs.srv import SetBool, Trigger
 
-from limbloc_ros.core.background import Segmentation
 from limbloc_ros.core.errors import ConfigError, InputError
+from limbloc_ros.core.segmentation import Segmentation
 from limbloc_ros.nodes.segmentation import SegmentationNode
 from limbloc_ros.nodes.simulated_cameras import SimulatedCamerasNode
 from limbloc_ros.rig.rig_file import load_rig

@@ -21,7 +21,6 @@ from __future__ import annotations
 import dataclasses
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -34,6 +33,7 @@ from limbloc_ros.core.config import BackgroundConfig, validated
 from limbloc_ros.core.errors import InputError
 from limbloc_ros.core.mask_cleaning import clean_mask
 from limbloc_ros.core.relight import relight, shows_nothing
+from limbloc_ros.core.segmentation import Segmentation
 
 Bytes = NDArray[np.uint8]
 Floats = NDArray[np.float32]
@@ -43,6 +43,11 @@ PATIENCE = 3
 
 FORMER, FITS = 2, 0.3
 """So many backgrounds of before are kept, and one is taken again when less than this share of the image differs."""
+
+PARTLY, SURELY_SAME, SURELY_LIGHT = 0.15, 0.8, 0.75
+"""When suddenly more than this share of the image differs, but not most of it, light is believed to be the cause only
+when the background's edges are still there with this correlation, and when this share of what differs changed as
+smoothly as light does."""
 
 MOVED_PATIENCE = 10
 """While a camera shows another view, every so many frames it is looked whether only the light has changed as well."""
@@ -55,32 +60,6 @@ RESTLESS_SIGMA, UNREST = 10.0, 0.005
 such pixels from which on somebody must have moved. Empty rooms had none, rooms with somebody who walks 3 to 20 %."""
 
 _RIM = np.ones((5, 5), dtype=np.uint8)
-
-
-@dataclass(frozen=True)
-class Segmentation:
-    """The mask of one image and what the model thinks of it.
-
-    Attributes:
-        mask: uint8 [H, W] of the image's size, 0 = background, 255 = foreground; all 0 while learning.
-        learning: the background is not known (yet, or again); the mask says nothing.
-        frames_learned: images that made the background so far.
-        foreground_fraction: part of the image that is foreground, 0 to 1.
-        light_jump: most of the image differs from the background: the light was switched or the camera moved.
-        moved: it shows another view than the background: the camera was moved, covered or exchanged. No mask until the
-            view is back, or the background is captured anew.
-        blind: the image shows nothing but one brightness; no mask.
-        gain: [3] brightness of the light relative to the learned background, per channel.
-    """
-
-    mask: Bytes
-    learning: bool
-    frames_learned: int
-    foreground_fraction: float
-    light_jump: bool
-    gain: tuple[float, float, float]
-    moved: bool = False
-    blind: bool = False
 
 
 class BackgroundModel:
@@ -108,6 +87,7 @@ class BackgroundModel:
         self._gain = np.ones(3, dtype=np.float32)
         self._busy = np.zeros((0, 0), dtype=np.uint8)
         self._changed = self._busy
+        self._share, self._doubts = 0.0, 0
         self._learned = 0
         self._ready = False
         self._noise_known = False
@@ -264,7 +244,7 @@ class BackgroundModel:
         planes = self._working(image)
         if not self._ready and shows_nothing(planes, None):
             return self._no_mask(blind=True)
-        if not self._ready and not self._recall(planes):
+        if not self._ready and not self._recall(planes, FITS):
             self._learn(planes)
             if self._learned >= self._config.learning_frames:
                 self._finish_learning()
@@ -280,15 +260,18 @@ class BackgroundModel:
             moved = self._light_jumped(planes)
             if moved is not None:
                 return self._no_mask(light_jump=True, moved=moved)
+        if share > self._config.relearn_fraction or self._partly_jumped(planes, far, share):
             change, colour = self._measure(planes)
-            far, _ = self._far(change)
-        self._upset, self._changed = 0, far
+            far, share = self._far(change)
+        self._upset = 0
+        if not self._doubts:
+            self._changed, self._share = far, share
         mask = clean_mask(change, colour, self._config)
         self._busy = cv2.dilate(mask, _RIM)
         if not self._frozen and self._config.learning_rate > 0:
             self._follow(planes, change)
-        fraction = cv2.countNonZero(mask) / mask.size
-        return Segmentation(self._full_size(mask), False, self._learned, fraction, False, self._gain_tuple())
+        fraction, gain = cv2.countNonZero(mask) / mask.size, tuple(map(float, self._gain))
+        return Segmentation(self._full_size(mask), False, self._learned, fraction, False, gain)
 
     def _working(self, image: Bytes) -> Bytes:
         """Check an image and bring it to planar [3, h, w] at working size."""
@@ -334,13 +317,10 @@ class BackgroundModel:
         """Sampling of the gain: about 3000 pixels whatever the image's size."""
         return max(1, int(np.sqrt(self._mean[0].size / 3000.0)))
 
-    def _gain_tuple(self) -> tuple[float, float, float]:
-        return float(self._gain[0]), float(self._gain[1]), float(self._gain[2])
-
     def _no_mask(self, light_jump: bool = False, moved: bool = False, blind: bool = False) -> Segmentation:
         assert self._image_shape is not None
         mask = np.zeros(self._image_shape, dtype=np.uint8)
-        return Segmentation(mask, True, self._learned, 0.0, light_jump, self._gain_tuple(), moved, blind)
+        return Segmentation(mask, True, self._learned, 0.0, light_jump, tuple(map(float, self._gain)), moved, blind)
 
     def _allocate(self, planes: Bytes) -> None:
         self._mean = planes.astype(np.float32)
@@ -417,7 +397,7 @@ class BackgroundModel:
             self._gain,
             self._busy,
             change,
-            np.float32(self._threshold()),
+            np.float32(round(self._config.threshold_sigmas * CHANGE_SCALE)),
             np.float32(1.0 - (1.0 - self._config.learning_rate) ** LEARNED_ROWS),
             floor,
             weight,
@@ -426,52 +406,70 @@ class BackgroundModel:
         )
         self._turn = (self._turn + 1) % LEARNED_ROWS
 
-    def _threshold(self) -> int:
-        return round(self._config.threshold_sigmas * CHANGE_SCALE)
-
     def _far(self, change: Bytes) -> tuple[Bytes, float]:
         """Where the image is not the background [h, w], and the share of it."""
-        far = np.asarray(cv2.compare(change, self._threshold(), cv2.CMP_GE), dtype=np.uint8)
+        threshold = round(self._config.threshold_sigmas * CHANGE_SCALE)
+        far = np.asarray(cv2.compare(change, threshold, cv2.CMP_GE), dtype=np.uint8)
         return far, cv2.countNonZero(far) / far.size
+
+    def _partly_jumped(self, planes: Bytes, far: Bytes, share: float) -> bool:
+        """Whether suddenly much more differs because of the light, which is followed then; or somebody came close."""
+        if self._frozen or share <= PARTLY or share <= 2 * self._share:
+            self._doubts = 0
+            return False
+        self._doubts = (self._doubts + 1) % PATIENCE
+        if self._doubts:
+            return False
+        if self._recall(planes, min(FITS, share / 2)):
+            return True
+        found = relight(planes, self._mean, self._changed | self._busy, cautious=True)
+        new = (far > 0) & (self._changed == 0)
+        is_light = bool(np.count_nonzero(new & found.follows) > SURELY_LIGHT * np.count_nonzero(new))
+        return is_light and found.agreement > SURELY_SAME and self._adopt(found.mean)
 
     def _light_jumped(self, planes: Bytes) -> bool | None:
         """Most of the image differs. None when there is a background for it now; else whether the camera has moved."""
         self._upset += 1
         if self._frozen:
             return False
-        if self._recall(planes):
+        if self._recall(planes, FITS):
             return None
         if self._upset < PATIENCE or (self._upset - PATIENCE) % MOVED_PATIENCE:
             return self._upset > PATIENCE
         found = relight(planes, self._mean, self._changed | self._busy)
         if found.other_view:
             return True
-        self._keep(self._mean, self._variance)
         if not found.same_view:
+            self._keep(self._mean, self._variance)
             self._forget()
             self._learn(planes)
             return False
-        self._relit += 1
-        brighter = np.clip(found.mean / np.maximum(self._mean, 1.0), 1.0, 3.0)
-        self._variance *= brighter * brighter  # noise grows with the light, if it does
-        self._mean = found.mean
-        self._gain = np.ones(3, dtype=np.float32)
-        self._fix_model()
+        self._adopt(found.mean)
         return None
+
+    def _adopt(self, mean: Floats) -> bool:
+        """Go on with the background under another light."""
+        self._keep(self._mean, self._variance)
+        brighter = np.clip(mean / np.maximum(self._mean, 1.0), 1.0, 3.0)
+        self._variance *= brighter * brighter  # noise grows with the light, if it does
+        self._mean, self._gain = mean, np.ones(3, dtype=np.float32)
+        self._relit += 1
+        self._fix_model()
+        return True
 
     def _keep(self, mean: Floats, variance: Floats) -> None:
         """Put a background by: its light may come back."""
         self._former.append((mean.copy(), np.minimum(variance, 6e4).astype(np.float16)))
 
-    def _recall(self, planes: Bytes) -> bool:
-        """Take a background of before that fits the image again."""
+    def _recall(self, planes: Bytes, most: float) -> bool:
+        """Take a background of before again when at most this share of the image differs from it."""
         kept = self._mean, self._variance, self._gain
         for n, former in reversed(list(enumerate(self._former))):
             self._mean, self._variance = former[0], former[1].astype(np.float32)
             self._fix_model()
             nobody = np.zeros(self._mean.shape[1:], dtype=np.uint8)
             self._gain = light_gain(planes, self._level, nobody, np.ones(3, dtype=np.float32), self._stride())
-            if self._far(self._measure(planes)[0])[1] > FITS:
+            if self._far(self._measure(planes)[0])[1] > most:
                 continue
             del self._former[n]
             if self._ready:

@@ -45,11 +45,13 @@ class Relit:
         mean: float32 [3, H, W] grey levels: the image itself where nobody is, the old background under the new light
             elsewhere.
         agreement: correlation of the background's edges with the image's, -1 to 1; NaN when it has too few.
+        follows: bool [H, W] where the brightness changed as smoothly over the image as light does.
         smooth: share of the image whose brightness changed as smoothly over the image as light does.
     """
 
     mean: Floats
     agreement: float
+    follows: NDArray[np.bool_]
     smooth: float
 
     @property
@@ -63,21 +65,24 @@ class Relit:
         return self.agreement < OTHER_VIEW
 
 
-def relight(planes: Bytes, mean: Floats, changed: Bytes) -> Relit:
+def relight(planes: Bytes, mean: Floats, changed: Bytes, cautious: bool = False) -> Relit:
     """The background under the light of an image.
 
     Args:
         planes: uint8 [3, H, W] the image under the new light.
         mean: float32 [3, H, W] the background under the old one, grey levels.
         changed: uint8 [H, W] non-zero where something else than background was a moment ago: a person, a shadow.
+        cautious: take the image only where its brightness changed as smoothly as light does; somebody may have come.
     """
     reach = 2 * (len(changed) // REACH) + 1
     there = cv2.morphologyEx(changed, cv2.MORPH_OPEN, np.ones((3, 3), dtype=np.uint8))  # not single noisy pixels
     free = cv2.dilate(there, np.ones((reach, reach), dtype=np.uint8)) == 0
-    field, smooth = _gain_field(planes, mean, free)
+    field, good, smooth = _gain_field(planes, mean, free)
     relit = np.minimum(mean * field, np.float32(255))
     agreement = _agreement(planes, relit, free)
-    return Relit(np.where(free, planes.astype(np.float32), relit).astype(np.float32), agreement, smooth)
+    if cautious:
+        free &= good
+    return Relit(np.where(free, planes.astype(np.float32), relit).astype(np.float32), agreement, good, smooth)
 
 
 def shows_nothing(planes: Bytes, mean: Floats | None) -> bool:
@@ -96,8 +101,8 @@ def shows_nothing(planes: Bytes, mean: Floats | None) -> bool:
     return spread < FLAT_SHARE * float(mean[:, ::_SAMPLING, ::_SAMPLING].std(axis=(1, 2)).max())
 
 
-def _gain_field(planes: Bytes, mean: Floats, free: NDArray[np.bool_]) -> tuple[Floats, float]:
-    """A smooth gain [3, H, W], and the share of cells that follow it."""
+def _gain_field(planes: Bytes, mean: Floats, free: NDArray[np.bool_]) -> tuple[Floats, NDArray[np.bool_], float]:
+    """A smooth gain [3, H, W], where the image follows it [H, W], and the share of cells that do."""
     height, width = free.shape
     rows, columns = max(height // CELL_PX, 4), max(width // CELL_PX, 4)
     usable = _shrink(free.astype(np.float32), rows, columns) > 0.99
@@ -110,7 +115,7 @@ def _gain_field(planes: Bytes, mean: Floats, free: NDArray[np.bool_]) -> tuple[F
     terms = np.stack([x**i * y**j for i in range(4) for j in range(4 - i)], axis=1)
     weight = usable.astype(np.float64).ravel()
     if np.count_nonzero(weight) < 4 * terms.shape[1]:
-        return np.ones_like(mean), 0.0
+        return np.ones_like(mean), np.zeros_like(free), 0.0
     course = np.empty_like(logs)
     for _ in range(8):  # least squares, ever again without what lies far off
         root = np.sqrt(weight)[:, None]
@@ -125,7 +130,8 @@ def _gain_field(planes: Bytes, mean: Floats, free: NDArray[np.bool_]) -> tuple[F
     for c in range(3):
         rest = cv2.GaussianBlur(np.where(good, logs[c] - course[c], 0.0), (0, 0), 1.5) / (amount + 0.1)
         field[c] = cv2.resize(np.exp(course[c] + rest).astype(np.float32), (width, height))
-    return field, float(np.count_nonzero(good)) / max(int(np.count_nonzero(usable)), 1)
+    follows = cv2.resize(cv2.erode(good.astype(np.uint8), np.ones((3, 3), np.uint8)), (width, height)) > 0
+    return field, follows, float(np.count_nonzero(good)) / max(int(np.count_nonzero(usable)), 1)
 
 
 def _agreement(planes: Bytes, relit: Floats, free: NDArray[np.bool_]) -> float:

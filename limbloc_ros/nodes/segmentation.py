@@ -16,10 +16,11 @@ from sensor_msgs.msg import CompressedImage, Image
 from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
 
-from limbloc_ros.core.background import UNREST, BackgroundModel, Segmentation, warm_up
+from limbloc_ros.core.background import UNREST, BackgroundModel, warm_up
 from limbloc_ros.core.config import BackgroundConfig, setting
 from limbloc_ros.core.errors import InputError
 from limbloc_ros.core.images import Pixels
+from limbloc_ros.core.segmentation import Segmentation
 from limbloc_ros.recordings.background_file import load_background, save_background
 from limbloc_ros.recordings.videos import pictures_in, read_picture
 from limbloc_ros.ros import image_messages, node_main, topics
