@@ -160,7 +160,7 @@ def test_a_bag_whose_record_claims_a_gigabyte_takes_no_memory():
         """,
         CORPUS / "bag_mcap" / "length_of_1_GB",
     )
-    assert "breaks off within the record" in said
+    assert "breaks off within the chunk" in said
 
 
 def test_a_zip_bomb_is_refused_before_it_unpacks(tmp_path, monkeypatch):
