@@ -239,7 +239,7 @@ def test_a_covered_and_a_turned_camera_are_named(graph: Graph) -> None:
     send(view[:, ::-1], 5)
     graph.until(diagnostics.says("segmentation: mask", "another view", "recapture_background"))
     assert not message_to_mask(masks[-1]).any()
-    send(0.6 * view * (1, 0.9, 0.8), 1)  # the view is back, and the light another one
+    send(0.8 * view * (1, 0.95, 0.9), 1)  # the view is back, and the light another one
     graph.until(diagnostics.says("segmentation: mask", "segmenting"))
 
 
