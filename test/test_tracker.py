@@ -139,10 +139,13 @@ class Stand:
         self.searched.append((self.frame, seed, weights, effort, harder))
         if self.scratch_cost is None:
             return None
-        return Fit(FigureState.standing([0.0, 0.0, 1.0]), SimpleNamespace(cost=self.scratch_cost))
+        return Fit(
+            FigureState.standing([0.0, 0.0, 1.0]), SimpleNamespace(cost=self.scratch_cost), judged=self.scratch_cost
+        )
 
     def refine(self, state, evidence, weights, iterations):
-        self.refined.append((self.frame, state, iterations))
+        if iterations != Tracker.FINAL_STEPS:
+            self.refined.append((self.frame, state, iterations))
         cost = self.costs.get(self.frame, 1e-4)
         return SimpleNamespace(state=FigureState.standing(state.root), system=SimpleNamespace(cost=cost))
 

@@ -86,11 +86,13 @@ class Fit:
         state: the figure.
         system: energy, gradient and matrix there.
         rivals: figures that explain the hull nearly as well, each with its energy over that of the best of them.
+        judged: the energy (m^2) of the figure with the weights by which figures are told apart.
     """
 
     state: FigureState
     system: lm.System
     rivals: Rivals = ()
+    judged: float = 0.0
 
 
 def gather_evidence(
@@ -236,19 +238,24 @@ def fit_from_scratch(
     if not torsos:
         return None
     winner, rivals = _fit_from_torsos(torsos[: 2 * effort.torsos], scene, effort)
-    if harder is not None and _judged(winner, scene) > DOUBTFUL_COST:
-        dressed = replace(scene, lenient=_dressed(scene.lenient), strict=_dressed(scene.strict))
+    judged = _judged(winner, scene)
+    if harder is not None and judged > DOUBTFUL_COST:
+        dressed = replace(scene, lenient=_dressed(scene.lenient), strict=firm(scene.weights))
         clothes = winner.state.shape[figure.proportions().clothing_from :]
         torsos = [_wearing(torso, clothes) for torso in torsos[: 2 * harder.torsos]]
         again, others = _fit_from_torsos(torsos, dressed, harder)
-        if _judged(again, scene) < _judged(winner, scene):
-            winner, rivals = again, others
-    return Fit(winner.state, winner.system, rivals)
+        if (cost := _judged(again, scene)) < judged:
+            winner, rivals, judged = again, others, cost
+    return Fit(winner.state, winner.system, rivals, judged)
 
 
 def _judged(fit: Refined, scene: Scene) -> float:
-    """The energy (m^2) by which figures are told apart: with the weights of the search, at its own minimum."""
-    return refine(fit.state, scene.full, _dressed(scene.strict), 3).system.cost
+    return refine(fit.state, scene.full, firm(scene.weights), 3).system.cost
+
+
+def firm(weights: Weights) -> Weights:
+    """The weights by which figures are told apart and followed: those of the search, but clothes may be worn."""
+    return _dressed(replace(weights, **SEARCH_WEIGHTS))
 
 
 def _dressed(weights: Weights) -> Weights:

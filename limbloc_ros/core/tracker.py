@@ -10,6 +10,7 @@ from limbloc_ros.core.energy import Evidence, Weights
 from limbloc_ros.core.engine_robust import (
     Effort,
     Fit,
+    firm,
     fit_from_scratch,
     gather_evidence,
     make_scene,
@@ -25,7 +26,7 @@ class Tracker:
     """Fits frame after frame, each from the last; starts anew when there is no last one or the fit went wrong."""
 
     #: A cost this much above the usual one, or above this many m^2, is no longer believed ...
-    DOUBT, DOUBTFUL_COST = 1.35, 2.2e-4
+    DOUBT, DOUBTFUL_COST = 1.35, 4.5e-4
     #: ... but starting anew, which takes as long as many followed frames, is tried only every so many frames: in a
     #: live room a slow fit makes the next step longer. Arms are checked as often. Each time that starting anew finds
     #: nothing better, the wait doubles, up to this: some hulls are just bad.
@@ -36,11 +37,15 @@ class Tracker:
     )
     #: Other pairs of arms that are tried when arms are checked.
     ARM_PAIRS = 2
+    #: The figure is carried along with the firm weights of the search, which lead from further off; so many more steps
+    #: with the final ones put its joints in their places.
+    FINAL_STEPS = 4
     #: Surface points that a figure is carried along on.
     POINTS = 450
 
     def __init__(self, seed: int, weights: Weights | None = None, effort: Effort | None = None) -> None:
         self._seed, self._weights, self._effort = seed, weights or Weights(), effort or self.SEARCH
+        self._firm = firm(self._weights)
         self.reset()
 
     def reset(self) -> None:
@@ -61,14 +66,15 @@ class Tracker:
         if self._last is not None:
             evidence = gather_evidence(hull, surface, self.POINTS, np.random.default_rng(self._seed))
             carried = FigureState(self._last.root + moved, self._last.rotations, self._last.shape)
-            result = refine(carried, evidence, self._weights, 10 if np.abs(moved).max() < 0.1 else 20)
+            result = refine(carried, evidence, self._firm, 8 if np.abs(moved).max() < 0.1 else 20)
             if self._frame % self.PATIENCE == 0:
                 result = self._check_arms(result, hull, surface, evidence)
-            fit = Fit(result.state, result.system)
-        if fit is None or self._doubts(fit.system.cost):
+            final = refine(result.state, evidence, self._weights, self.FINAL_STEPS)
+            fit = Fit(final.state, final.system, judged=result.system.cost)
+        if fit is None or self._doubts(fit.judged):
             self._last_scratch = self._frame
             scratch = fit_from_scratch(hull, surface, self._seed, self._weights, self._effort, None)
-            if scratch is not None and (fit is None or scratch.system.cost < 0.95 * fit.system.cost):
+            if scratch is not None and (fit is None or scratch.judged < 0.95 * fit.judged):
                 fit, self._wait = scratch, self.PATIENCE
             else:
                 self._wait = min(2 * self._wait, self.LONGEST_WAIT)
@@ -77,7 +83,7 @@ class Tracker:
             return None
         # the usual cost follows slowly, so one odd frame is judged by the calm ones before it
         fresh = self._last is None or self._usual_cost == 0.0
-        self._usual_cost = fit.system.cost if fresh else 0.9 * self._usual_cost + 0.1 * fit.system.cost
+        self._usual_cost = fit.judged if fresh else 0.9 * self._usual_cost + 0.1 * fit.judged
         self._last = fit.state
         return fit
 
@@ -93,7 +99,7 @@ class Tracker:
         best = result
         for state in with_arms(result.state, scene, self.ARM_PAIRS):
             settled = refine(state, scene.quick, scene.lenient, 5).state
-            other = refine(settled, evidence, self._weights, 8)
+            other = refine(settled, evidence, self._firm, 8)
             if other.system.cost < 0.94 * best.system.cost:
                 best = other
         return best
