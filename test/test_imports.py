@@ -85,11 +85,11 @@ OUTSIDE = {
     "core": NUMERIC,
     "rig": NUMERIC | {"yaml", "matplotlib", "mpl_toolkits"},
     "simulation": NUMERIC,
-    "recordings": NUMERIC | {"yaml", "rosbags"},
+    "recordings": NUMERIC | {"rosbags", "distributed"},
     "export": NUMERIC | {"ezc3d"},
     "report": NUMERIC | {"matplotlib", "mpl_toolkits", "open3d"},
     "ros": NUMERIC | ROS,
-    "nodes": NUMERIC | ROS | {"yaml", "foxglove"},
+    "nodes": NUMERIC | ROS | {"foxglove"},
     "commands": NUMERIC | ROS | {"yaml", "tqdm"},
 }
 
