@@ -49,6 +49,9 @@ PARTLY, SURELY_SAME, SURELY_LIGHT = 0.15, 0.8, 0.75
 when the background's edges are still there with this correlation, and when this share of what differs changed as
 smoothly as light does."""
 
+SWITCHED = 0.15
+"""When the logarithm of the light's gain changes by more from image to image, a background of before may fit better."""
+
 MOVED_PATIENCE = 10
 """While a camera shows another view, every so many frames it is looked whether only the light has changed as well."""
 
@@ -249,7 +252,7 @@ class BackgroundModel:
             if self._learned >= self._config.learning_frames:
                 self._finish_learning()
             return self._no_mask()
-        self._gain = light_gain(planes, self._level, self._busy, self._gain, self._stride())
+        last, self._gain = self._gain, light_gain(planes, self._level, self._busy, self._gain, self._stride())
         if not self._noise_known:
             self._estimate_noise(planes)
         change, colour = self._measure(planes)
@@ -260,7 +263,8 @@ class BackgroundModel:
             moved = self._light_jumped(planes)
             if moved is not None:
                 return self._no_mask(light_jump=True, moved=moved)
-        if share > self._config.relearn_fraction or self._partly_jumped(planes, far, share):
+        switched = float(np.abs(np.log(self._gain / last)).max()) > SWITCHED and self._recall(planes, share)
+        if switched or share > self._config.relearn_fraction or self._partly_jumped(planes, far, share):
             change, colour = self._measure(planes)
             far, share = self._far(change)
         self._upset = 0
