@@ -138,13 +138,13 @@ class Machines:
             server = ["fast-discovery-server", "-i", "0", "-l", network.addresses[-1], "-p", str(PORT)]
             self._start(network.names[-1], server)
         sources, work = network.names[:-1], network.names[-1]
-        start_s = float(int(time.time()) + 15)
+        start_s = float(int(time.time()) + 20)
         shares = [rig.names[n :: len(sources)] for n in range(len(sources))]
         segmenters = [_segmentation(name, setup.sent) for name in rig.names]
         for host, share in zip(sources, shares, strict=True):
             film = {
                 "rig_file": str(folder / "rig.yaml"), "cameras": list(share), "rate_hz": rate_hz, "start_s": start_s,
-                "empty_s": 10.0, "motions": ["t_pose"],
+                "empty_s": 15.0, "motions": ["t_pose"],
                 "transport": "compressed" if setup.sent == "compressed" else "raw",
             }  # fmt: skip
             nodes = [{"kind": "simulated_cameras", "name": f"film_{host}", "parameters": film}]

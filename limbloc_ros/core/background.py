@@ -263,7 +263,7 @@ class BackgroundModel:
             moved = self._light_jumped(planes)
             if moved is not None:
                 return self._no_mask(light_jump=True, moved=moved)
-        switched = float(np.abs(np.log(self._gain / last)).max()) > SWITCHED and self._recall(planes, share)
+        switched = float(np.abs(np.log(self._gain / last)).max()) > SWITCHED and self._recall(planes, 0.8 * share)
         if switched or share > self._config.relearn_fraction or self._partly_jumped(planes, far, share):
             change, colour = self._measure(planes)
             far, share = self._far(change)
