@@ -341,6 +341,7 @@ def test_offline_any_number_of_jobs_gives_everybody_the_same(tmp_path, monkeypat
     """Also where they touch, for which the parent process carves and fits by itself; and the files hold everybody."""
     monkeypatch.setattr("limbloc_ros.core.people.PERSON", 1)  # frames that are fitted alone take a second each
     source = Silhouettes(room(2, "touching"), [5.0, 5.9, 6.1])
+    assert len(components(carved(room(2, "touching"), 6.1))) == 1
     config = OfflineConfig(fit=FitConfig(temporal=False))
     runs = [process(source, config, jobs=jobs) for jobs in (1, 2)]  # type: ignore[arg-type]
     assert runs[0].numbers == (1, 2)
