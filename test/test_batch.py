@@ -13,11 +13,14 @@ import pytest
 from distributed import Client, LocalCluster
 
 from limbloc_ros import cli
+from limbloc_ros.core.config import FitConfig
 from limbloc_ros.core.errors import ConfigError
 from limbloc_ros.recordings.batch import Task, do, do_here, do_on_cluster
 from limbloc_ros.recordings.offline import OfflineConfig
 from limbloc_ros.recordings.results import Run
 
+#: Following is the quicker way to fit.
+CONFIG = OfflineConfig(fit=FitConfig(temporal=True))
 CASE = Path(__file__).parent / "data" / "benchmark" / "public" / "seq_wave"
 
 
@@ -38,7 +41,7 @@ def recordings(tmp_path_factory):
 
 
 def tasks_into(recordings, out):
-    return [Task(recordings / name, out / name, None, OfflineConfig()) for name in ("long", "short", "broken")]
+    return [Task(recordings / name, out / name, None, CONFIG) for name in ("long", "short", "broken")]
 
 
 @pytest.fixture(scope="module")
@@ -94,16 +97,20 @@ def test_finished_recordings_are_not_done_again(recordings, here):
 
 
 def test_results_of_other_parameters_are_not_taken_for_these(recordings, here):
-    outcome = do(Task(recordings / "long", here / "long", None, OfflineConfig(), leave_out=1))
+    outcome = do(Task(recordings / "long", here / "long", None, CONFIG, leave_out=1))
     assert "holds results of another recording or other parameters" in outcome.error
 
 
 def test_the_command_line(recordings, here, capsys):
-    assert cli.main(["batch", str(recordings / "long"), str(recordings / "broken"), "--out", str(here)]) == 1
+    assert (
+        cli.main(["batch", str(recordings / "long"), str(recordings / "broken"), "--temporal", "--out", str(here)]) == 1
+    )
     said = capsys.readouterr()
     assert "1 of 2 recordings are done" in said.out
     assert "2 of 2 frames have a pose (done before)" in said.out + said.err
-    assert cli.main(["batch", str(recordings / "long"), str(recordings / "long"), "--out", str(here)]) == 2
+    assert (
+        cli.main(["batch", str(recordings / "long"), str(recordings / "long"), "--temporal", "--out", str(here)]) == 2
+    )
     assert "twice: long" in capsys.readouterr().err
 
 

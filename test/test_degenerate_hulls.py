@@ -156,7 +156,7 @@ def test_no_nan_leaves_the_node():
     """Also not when the node is told to publish what it does not believe itself."""
     graph = Graph()
     try:
-        node = graph.add(PoseNode, publish_unreliable=True)
+        node = graph.add(PoseNode, publish_unreliable=True, fit__temporal=True)
         clouds = graph.publisher(PointCloud2, topics.HULL, topics.WORK_QOS)
         seen = [
             graph.collect(kind, topic, qos)
