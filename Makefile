@@ -41,10 +41,10 @@ lint: setup
 bench: setup
 	@$(RUN) benchmarks/score_suites.py $(ARGS)
 
-# atheris, which brings libFuzzer, is installed when it is called for the first time.
 soak: setup
 	@$(RUN) benchmarks/soak.py $(ARGS)
 
+# atheris, which brings libFuzzer, is installed when it is called for the first time.
 fuzz: setup
 	@$(RUN) -c 'import atheris' 2>/dev/null || $(RUN) -m pip install -qq 'atheris>=3.0,<4'
 	@nice -n 15 $(RUN) -m fuzz $(ARGS)
