@@ -25,6 +25,13 @@ from limbloc_ros.core.tracker import Tracker
 CUT_M2 = 0.02
 
 
+#: Calls every kernel of a search once.
+_LEAST_EFFORT = engine_robust.Effort(
+    torsos=1, leg_pairs=1, starts=1, survivors=1, arm_repairs=1, strict=1, single_arms=1, single_legs=1, rounds=1,
+    finalists=1, quick_points=50, points=50, iterations=(1, 1, 1, 1, 1),
+)  # fmt: skip
+
+
 class Carver:
     """The carving half: masks of one instant -> hull. Holds what only depends on the rig."""
 
@@ -97,6 +104,7 @@ class PoseEstimator:
         assert isinstance(hull, Hull)
         # The first frame is searched from scratch, with the kernels of every frame alone; the second follows.
         estimator = PoseEstimator(FitConfig(temporal=True))
+        estimator._tracker = Tracker(0, effort=_LEAST_EFFORT)
         estimator.estimate(hull)
         estimator.estimate(hull)
 
