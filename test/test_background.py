@@ -452,6 +452,23 @@ class TestScenes:
         assert (model.relit, result.light_jump) == (2, False)
         assert np.count_nonzero(result.mask) == pytest.approx(800, rel=0.1)
 
+    def test_a_background_of_another_light_is_restored_with_somebody_in_the_room(self):
+        rng = np.random.default_rng(9)
+        picture = textured(rng) * 0.7
+        model, again = (BackgroundModel(BackgroundConfig(learning_frames=5)) for _ in range(2))
+        for _ in range(6):
+            model.segment(noisy(rng, picture))
+        again.restore(model.state())
+        lit = picture * np.linspace(1.1, 1.9, WIDTH)[None, :, None]
+        for column in (50, 50, 50, 50, 90):
+            image = lit.copy()
+            image[30:70, column : column + 20] = (30, 160, 60)
+            result = again.segment(noisy(rng, image))
+        assert again.relit == 1
+        truth = np.zeros((HEIGHT, WIDTH), dtype=bool)
+        truth[30:70, 90:110] = True
+        assert iou(result.mask > 0, truth) > 0.85  # and no ghost at the first place
+
     def test_a_lamp_that_lights_a_part_of_the_room_is_followed_and_who_comes_close_is_not_learned(self):
         rng = np.random.default_rng(8)
         picture = textured(rng) * 0.8

@@ -91,6 +91,7 @@ class BackgroundModel:
         self._busy = np.zeros((0, 0), dtype=np.uint8)
         self._changed = self._busy
         self._share, self._doubts = 0.0, 0
+        self._fresh = True  # no image has been segmented yet: somebody may be there whom we never saw
         self._learned = 0
         self._ready = False
         self._noise_known = False
@@ -267,7 +268,7 @@ class BackgroundModel:
         if switched or share > self._config.relearn_fraction or self._partly_jumped(planes, far, share):
             change, colour = self._measure(planes)
             far, share = self._far(change)
-        self._upset = 0
+        self._upset, self._fresh = 0, False
         if not self._doubts:
             self._changed, self._share = far, share
         mask = clean_mask(change, colour, self._config)
@@ -440,7 +441,7 @@ class BackgroundModel:
             return None
         if self._upset < PATIENCE or (self._upset - PATIENCE) % MOVED_PATIENCE:
             return self._upset > PATIENCE
-        found = relight(planes, self._mean, self._changed | self._busy)
+        found = relight(planes, self._mean, self._changed | self._busy, cautious=self._fresh)
         if found.other_view:
             return True
         if not found.same_view:

@@ -137,7 +137,7 @@ class SegmentationNode(Node):
             self.watch_for_freeze(pixels, stamp)
             self.last = self.model.segment(pixels)
             if self.model.relit > relit:
-                self.relit_s = time.monotonic()
+                self.relit_s, self.saved_s = time.monotonic(), None  # who is started again needs the new light
             self.meter.tick(self.health.latency_s(stamp))
             if self.frozen_s > FROZEN_S and self.last.mask.any():
                 return  # an old silhouette would cut the hull of who has moved since
