@@ -67,6 +67,17 @@ def test_the_tracker_follows_a_walk():
         assert error.mean() < 0.05, frame
 
 
+def test_a_person_keeps_the_size_while_being_followed(monkeypatch):
+    def spread():
+        follower = Tracker(seed=0)
+        shapes = [follow(follower, frame).state.shape for frame in FRAMES]
+        return np.std(shapes[1:], axis=0).mean()
+
+    remembered = spread()
+    monkeypatch.setattr(Tracker, "SIZE_WEIGHT", 0.0)
+    assert remembered < 0.5 * spread()
+
+
 def test_the_tracker_starts_from_the_frame_before_until_it_is_reset():
     follower = Tracker(seed=0)
     alone = follow(follower, 20).state.to_vector()
@@ -143,7 +154,7 @@ class Stand:
             FigureState.standing([0.0, 0.0, 1.0]), SimpleNamespace(cost=self.scratch_cost), judged=self.scratch_cost
         )
 
-    def refine(self, state, evidence, weights, iterations):
+    def refine(self, state, evidence, weights, iterations, size=None):
         if iterations != Tracker.FINAL_STEPS:
             self.refined.append((self.frame, state, iterations))
         cost = self.costs.get(self.frame, 1e-4)

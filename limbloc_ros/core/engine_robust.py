@@ -123,19 +123,37 @@ def outline_rays(hull: Hull, surface: Surface, rows: NDArray[np.int64]) -> Array
     return np.where(known[:, None], rays, 0.0)
 
 
-def refine(state: FigureState, evidence: Evidence, weights: Weights, iterations: int) -> lm.LmResult[FigureState]:
+@dataclass(frozen=True)
+class KnownSize:
+    """What earlier frames say of a person's size: a shape, and how much (m^2) a squared deviation from it costs."""
+
+    shape: Array
+    weight: float
+
+
+def refine(
+    state: FigureState, evidence: Evidence, weights: Weights, iterations: int, size: KnownSize | None = None
+) -> lm.LmResult[FigureState]:
     """Levenberg-Marquardt on all parameters at once."""
     step = np.full(3 + figure.N_DOF + len(state.shape), 0.5)
     step[:3] = 0.1
     step[3 + figure.N_DOF] = 0.1
     step[4 + figure.N_DOF :] = 1.0
-    return lm.minimise(
-        lambda s: energy.system(s, evidence, weights),
-        lambda s, delta: s.moved(delta),
-        state,
-        iterations=iterations,
-        largest_step=step,
-    )
+
+    def evaluate(s: FigureState) -> lm.System:
+        system = energy.system(s, evidence, weights)
+        return system if size is None else _sized(system, s.shape, size)
+
+    return lm.minimise(evaluate, lambda s, delta: s.moved(delta), state, iterations=iterations, largest_step=step)
+
+
+def _sized(system: lm.System, shape: Array, size: KnownSize) -> lm.System:
+    deviation = shape - size.shape
+    gradient, matrix = system.gradient.copy(), system.matrix.copy()
+    rows = np.arange(len(gradient) - len(shape), len(gradient))
+    gradient[rows] += size.weight * deviation
+    matrix[rows, rows] += size.weight
+    return lm.System(system.cost + size.weight * float(deviation @ deviation), gradient, matrix)
 
 
 @dataclass(frozen=True)

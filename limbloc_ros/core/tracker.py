@@ -4,12 +4,14 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from limbloc_ros.core import lm
 from limbloc_ros.core.energy import Evidence, Weights
 from limbloc_ros.core.engine_robust import (
     Effort,
     Fit,
+    KnownSize,
     firm,
     fit_from_scratch,
     gather_evidence,
@@ -20,6 +22,8 @@ from limbloc_ros.core.engine_robust import (
 from limbloc_ros.core.figure import FigureState
 from limbloc_ros.core.hull import Hull
 from limbloc_ros.core.surface import Surface
+
+Array = NDArray[np.float64]
 
 
 class Tracker:
@@ -40,6 +44,9 @@ class Tracker:
     #: The figure is carried along with the firm weights of the search, which lead from further off; so many more steps
     #: with the final ones put its joints in their places.
     FINAL_STEPS = 4
+    #: People do not change their size, and one hull says little of it: what a squared deviation from the mean shape so
+    #: far costs (m^2) per frame in that mean, and how many frames count.
+    SIZE_WEIGHT, REMEMBERED = 2e-4, 20
     #: Surface points that a figure is carried along on.
     POINTS = 450
 
@@ -56,6 +63,7 @@ class Tracker:
         self._last_scratch = -self.PATIENCE
         self._wait = self.PATIENCE
         self._centre = np.zeros(3)
+        self._size, self._sized = np.zeros(0), 0
 
     def follow(self, hull: Hull, surface: Surface) -> Fit | None:
         """Fit the next frame."""
@@ -69,13 +77,16 @@ class Tracker:
             result = refine(carried, evidence, self._firm, 8 if np.abs(moved).max() < 0.1 else 20)
             if self._frame % self.PATIENCE == 0:
                 result = self._check_arms(result, hull, surface, evidence)
-            final = refine(result.state, evidence, self._weights, self.FINAL_STEPS)
+            size = KnownSize(self._size, self.SIZE_WEIGHT * min(self._sized, self.REMEMBERED))
+            final = refine(result.state, evidence, self._weights, self.FINAL_STEPS, size)
+            self._remember(final.state.shape)
             fit = Fit(final.state, final.system, judged=result.system.cost)
         if fit is None or self._doubts(fit.judged):
             self._last_scratch = self._frame
             scratch = fit_from_scratch(hull, surface, self._seed, self._weights, self._effort, None)
             if scratch is not None and (fit is None or scratch.judged < 0.95 * fit.judged):
                 fit, self._wait = scratch, self.PATIENCE
+                self._size, self._sized = scratch.state.shape, 1
             else:
                 self._wait = min(2 * self._wait, self.LONGEST_WAIT)
         if fit is None:
@@ -86,6 +97,11 @@ class Tracker:
         self._usual_cost = fit.judged if fresh else 0.9 * self._usual_cost + 0.1 * fit.judged
         self._last = fit.state
         return fit
+
+    def _remember(self, shape: Array) -> None:
+        """The mean shape of the last frames."""
+        self._sized = min(self._sized + 1, 2 * self.REMEMBERED)
+        self._size = self._size + (shape - self._size) / self._sized
 
     def _doubts(self, cost: float) -> bool:
         waited = self._frame - self._last_scratch >= self._wait
