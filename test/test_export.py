@@ -14,10 +14,10 @@ from motion_files import Gltf, read_bvh, read_c3d, read_ply
 from limbloc_ros import cli
 from limbloc_ros.core.errors import ConfigError, InputError, NoPerson
 from limbloc_ros.core.figure import FigureState, flesh_distance
+from limbloc_ros.core.files import replaced
 from limbloc_ros.core.pose import JOINT, JOINT_NAMES
 from limbloc_ros.export.bvh import bvh_text
 from limbloc_ros.export.clip import clip_of
-from limbloc_ros.core.files import replaced
 from limbloc_ros.export.gltf import write_gltf
 from limbloc_ros.export.markers import MARKER_SETS, joints_of_markers, marker_places
 from limbloc_ros.export.skeleton import ORIGINS, TIPS, skeleton_of
