@@ -30,8 +30,14 @@ $(STAMP): setup.py setup.cfg pyproject.toml requirements/$(ROS).lock tools/setup
 demo: setup
 	@$(RUN) -m limbloc_ros demo $(ARGS)
 
+# Calculations side by side, then what starts nodes and processes, one after the other. ARGS are pytest's.
 test: setup
+ifeq ($(ARGS),)
+	@$(RUN) -m pytest -q -n 2 --dist worksteal -m "not live"
+	@$(RUN) -m pytest -m live
+else
 	@$(RUN) -m pytest $(ARGS)
+endif
 
 lint: setup
 	@$(RUN) -m ruff check .

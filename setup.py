@@ -60,6 +60,7 @@ setup(
         "dev": [
             "psutil>=5.9,<8",
             "pytest>=8,<10",
+            "pytest-xdist>=3.6,<4",
             "hypothesis>=6.100,<7",
             "ruff==0.17.6",
             "mypy==2.4.1",
