@@ -33,7 +33,7 @@ demo: setup
 # Calculations side by side, then what starts nodes and processes, one after the other. ARGS are pytest's.
 test: setup
 ifeq ($(ARGS),)
-	@$(RUN) -m pytest -q -n 2 --dist worksteal -m "not live"
+	@$(RUN) -m pytest -q -n 2 --dist loadfile -m "not live"
 	@$(RUN) -m pytest -m live
 else
 	@$(RUN) -m pytest $(ARGS)
