@@ -258,12 +258,13 @@ def test_the_true_figure_explains_its_own_surface(case):
     assert energy.system(state, evidence, only(surface=1.0)).cost > 1e-4
 
 
-def surface_cost(point, normal, gate=0.0, inside=2.0, width=0.1, ray=(0.0, 0.0, 0.0)):
+def surface_cost(point, normal, gate=0.0, inside=2.0, width=0.1, ray=(0.0, 0.0, 0.0), hint=-1):
+    hints = np.array([hint])
     spheres, radii = np.array([[0.0, 0.0, 0.0], [0.5, 0.0, 0.0]]), np.array([0.1, 0.1])
     parts = np.array([[0, 0, 0], [1, 1, 1]])
     blocks, slopes = np.zeros((2, 12, 12)), np.zeros((2, 12))
     cost = energy.surface_term(
-        np.array([point]), np.array([normal]), np.array([ray]), np.ones(1),
+        np.array([point]), np.array([normal]), np.array([ray]), np.ones(1), hints,
         parts, spheres, radii, width, gate, inside, blocks, slopes,
     )  # fmt: skip
     return cost, slopes
@@ -284,8 +285,12 @@ def test_surface_term_worked_by_hand():
     cost, slopes = surface_cost([0.24, 0.0, 0.0], back, gate=0.03)
     assert cost == pytest.approx(geman_mcclure(0.16))
     assert not slopes[0].any()
+    slopes_far = slopes
     cost, slopes = surface_cost([0.24, 0.0, 0.0], ahead, gate=0.03)
     assert cost == pytest.approx(geman_mcclure(0.14))
+    # whichever part is asked first
+    for hint in (0, 1):
+        np.testing.assert_array_equal(surface_cost([0.24, 0.0, 0.0], back, gate=0.03, hint=hint)[1], slopes_far)
     # nothing costs more than the square of the width
     assert surface_cost([90.0, 0.0, 0.0], ahead)[0] == pytest.approx(0.01, rel=1e-4)
 

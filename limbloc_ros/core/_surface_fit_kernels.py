@@ -159,6 +159,7 @@ def surface_term(
     normals: Any,
     rays: Any,
     weight_of: Any,
+    hints: Any,
     parts: Any,
     spheres: Any,
     radii: Any,
@@ -168,7 +169,10 @@ def surface_term(
     blocks: Any,
     slopes: Any,
 ) -> float:
-    """Hull surface points to the nearest part: the figure should explain the whole surface (see `nearest_part`)."""
+    """Hull surface points to the nearest part: the figure should explain the whole surface (see `nearest_part`).
+
+    `hints` [Q] holds the part of each point the last time, and is written: from step to step it is mostly the same.
+    """
     bounds = part_bounds(parts, spheres, radii)
     w = np.empty(3)
     away = np.empty(3)
@@ -177,7 +181,9 @@ def surface_term(
     p = -1
     cost = 0.0
     for q in range(len(query)):
-        _, p = nearest_part(query[q], normals[q], rays[q], parts, bounds, spheres, radii, gate, 1e9, p, w, scratch)
+        hint = hints[q] if hints[q] >= 0 else p
+        _, p = nearest_part(query[q], normals[q], rays[q], parts, bounds, spheres, radii, gate, 1e9, hint, w, scratch)
+        hints[q] = p
         d = offset_from(query[q], rays[q], parts[p], w, spheres, radii, away)
         c, wd = robust_weight(d, width)
         scale = weight_of[q] * (inside_weight if d < 0.0 else 1.0)

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,6 +57,7 @@ class Evidence:
         sdf: float32 [nx, ny, nz], m.
         origin: [3] centre of sdf[0, 0, 0], m, world.
         voxel_m: edge length of a voxel, m.
+        hints: int64 [Q] the part that explained each point when the energy was last worked out; saves time only.
     """
 
     points: Array
@@ -66,6 +67,10 @@ class Evidence:
     sdf: NDArray[np.float32]
     origin: Array
     voxel_m: float
+    hints: NDArray[np.int64] = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "hints", np.full(len(self.points), -1))
 
 
 def _axis_rotation(axis: int, degrees: float) -> Array:
@@ -215,6 +220,7 @@ def system(state: FigureState, evidence: Evidence, weights: Weights) -> System:
         evidence.normals,
         evidence.rays,
         w.surface * evidence.point_weights,
+        evidence.hints,
         *flesh,
         w.surface_width_m,
         w.normal_gate_m,
