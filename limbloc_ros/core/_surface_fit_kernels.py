@@ -90,7 +90,7 @@ def nearest_part(
             nz = -w[0] * near[0, 2] - w[1] * near[1, 2] - w[2] * near[2, 2]
             length = math.sqrt(nx * nx + ny * ny + nz * nz) + 1e-12
             d += gate * (1.0 - (nx * normal[0] + ny * normal[1] + nz * normal[2]) / length)
-        if d < best:
+        if d < best or (d == best and p < best_part):  # parts share spheres: of equals the first, whatever the hint
             best = d
             best_part = p
             best_w[0] = w[0]
