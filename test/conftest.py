@@ -9,7 +9,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 #: A test file that speaks of any of these starts nodes or processes, and waits for them.
-_LIVE = ("rclpy", "ros_graph", "subprocess", "LocalCluster")
+_LIVE = ("rclpy", "ros_graph", "subprocess", "LocalCluster", "import faults", "from faults")
 
 
 def pytest_collection_modifyitems(items):
