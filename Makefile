@@ -30,11 +30,13 @@ $(STAMP): setup.py setup.cfg pyproject.toml requirements/$(ROS).lock tools/setup
 demo: setup
 	@$(RUN) -m limbloc_ros demo $(ARGS)
 
-# Calculations side by side, then what starts nodes and processes, one after the other. ARGS are pytest's.
+# Calculations side by side, then what starts nodes and processes, one after the other, then
+# whole rooms. ARGS are pytest's.
 test: setup
 ifeq ($(ARGS),)
-	@$(RUN) -m pytest -q -n 2 --dist loadfile -m "not live"
-	@$(RUN) -m pytest -m live
+	@$(RUN) -m pytest -q -n 2 --dist loadfile -m "not live and not room"
+	@$(RUN) -m pytest -q -m live
+	@$(RUN) -m pytest -q -m room
 else
 	@$(RUN) -m pytest $(ARGS)
 endif

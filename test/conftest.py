@@ -8,16 +8,19 @@ from pathlib import Path
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
-#: A test file that speaks of any of these starts nodes or processes, and waits for them.
-_LIVE = ("rclpy", "ros_graph", "subprocess", "LocalCluster", "import faults", "from faults")
+#: A test file that speaks of any of these starts nodes or processes, and waits for them ...
+_LIVE = ("rclpy", "ros_graph", "subprocess", "LocalCluster")
+#: ... and of these a whole room, from a process that must be the first in which DDS starts: it reads its profile once.
+_ROOM = ("from faults",)
 
 
 def pytest_collection_modifyitems(items):
-    """Mark what runs nodes or processes as `live`: one at a time, the others may run side by side (see Makefile)."""
-    live = {}
+    """Mark what runs nodes or processes as `live`, whole rooms as `room`; others may run side by side (Makefile)."""
+    marks = {}
     for item in items:
-        if item.path not in live:
+        if item.path not in marks:
             text = Path(item.path).read_text()
-            live[item.path] = any(word in text for word in _LIVE)
-        if live[item.path]:
-            item.add_marker("live")
+            room = any(word in text for word in _ROOM)
+            marks[item.path] = "room" if room else "live" if any(word in text for word in _LIVE) else None
+        if marks[item.path]:
+            item.add_marker(marks[item.path])
