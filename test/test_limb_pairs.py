@@ -218,7 +218,7 @@ def random_limbs(person, kind, side, rng, count):
         upper, lower = rng.normal(size=(2, 3)) + 1.2 * outward - np.array([0.0, 0.0, 1.0])
         row[:3] = origins[first] + lengths[0] * unit(upper)
         row[3:6] = row[:3] + lengths[1] * unit(lower)
-    return Limbs(origins[first], lengths, np.zeros(3), 0.1, found)
+    return Limbs(origins[first], lengths, found)
 
 
 @pytest.fixture

@@ -162,9 +162,13 @@ def best_limbs(
 
 @dataclass(frozen=True)
 class _OpenQuestion:
-    """The surface points that the body leaves to the limbs: themselves, how near the body is, and what they cost so."""
+    """The surface points that the body leaves to the limbs: themselves, how near the body is, and what they cost so.
+
+    `surface` [3] is what the kernels must know of the surface term: width, gate and weight inside.
+    """
 
     scene: tuple[Array, Array, Array]
+    surface: Array
     gap: Array
     costs: Array
     point_weight: float
@@ -182,7 +186,7 @@ def _open_question(
     share = w.surface * float(evidence.point_weights[rows].sum())
     rows = rows[:: -(-len(rows) // MOST_POINTS) or 1]
     asked = scene[0][rows], scene[1][rows], scene[2][rows]
-    return _OpenQuestion(asked, np.minimum(gap[rows], REACH_M), costs[rows], share / max(len(rows), 1))
+    return _OpenQuestion(asked, surface, np.minimum(gap[rows], REACH_M), costs[rows], share / max(len(rows), 1))
 
 
 def _fits(
@@ -210,8 +214,7 @@ def _fits(
     kernels.limb_fits(
         limbs.found, origins[first], rotations[figure.PARENTS[first]], _hinge_rest(kind, first), table.sign, joints,
         table.spheres, table.sphere_bones, offsets, placed.spheres.copy(), placed.radii, figure.PART_SPHERES,
-        figure.PART_SPHERES[table.parts], *question.scene, question.gap,
-        np.array([w.surface_width_m, w.normal_gate_m, w.surface_inside]),
+        figure.PART_SPHERES[table.parts], *question.scene, question.gap, question.surface,
         table.samples, table.sample_parts, evidence.sdf, evidence.origin, evidence.voxel_m,
         np.array([w.inclusion_slack_m, w.inclusion_width_m, w.inclusion]), table.penetration,
         np.array([w.penetration_allowed, w.penetration_width_m, w.penetration]),

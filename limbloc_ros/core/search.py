@@ -229,8 +229,6 @@ class Limbs:
 
     base: Array
     lengths: Array
-    radii: Array
-    tip_m: float
     found: Array
 
 
@@ -280,4 +278,4 @@ def limb_candidates(
         base, lengths, radii, tip_m, near, sphere_directions(100), hull.sdf, hull.origin_m, hull.voxel_m,
         explained, STRIDE, kind.skip, 0.04, kind.explained_weight, forbidden, keep,
     )  # fmt: skip
-    return Limbs(base, lengths, radii, tip_m, found)
+    return Limbs(base, lengths, found)
