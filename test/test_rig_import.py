@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import yaml
 from scipy.spatial.transform import Rotation
 
 from limbloc_ros import cli
@@ -100,6 +101,37 @@ def test_kalibr_chain_worked_by_hand():
     np.testing.assert_allclose(centres[0, :2], -centres[2, :2], atol=1e-8)
     assert [c.distortion_model for c in rig.cameras] == ["radtan", "fisheye", "none"]
     assert rig.cameras[1].K[1].tolist() == [0, 462, 239]
+
+
+def test_kalibr_own_file_agrees_with_its_inertial_unit():
+    """Each camera's pose against the inertial unit, in the same file, gives the pair's pose without T_cn_cnm1."""
+    rig, said = imported("kalibr_euroc_camchain.yaml", up="cameras", camera_heights={"cam0": 1.2})
+    one, two = rig.cameras
+    chain = yaml.safe_load((RIGS / "kalibr_euroc_camchain.yaml").read_text())
+    expected = np.array(chain["cam0"]["T_cam_imu"]) @ inverse(np.array(chain["cam1"]["T_cam_imu"]))
+    np.testing.assert_allclose(inverse(one.T_world_camera) @ two.T_world_camera, expected, atol=1e-4)
+    assert (centre(two) - centre(one)) @ one.T_world_camera[:3, 0] == pytest.approx(0.110, abs=5e-4)  # EuRoC's baseline
+    assert [c.distortion_model for c in rig.cameras] == ["fisheye", "fisheye"]
+    assert (one.width, one.height) == (752, 480)
+    assert any("the cameras look the same way: nothing confirms it" in line for line in said)  # a stereo pair
+    assert any("below the cameras" in line for line in said)
+
+
+def test_easymocap_users_file_as_opencv_reads_it():
+    """EasyMocap reads with OpenCV's FileStorage, and takes x_cam = R X + T: the same pixels, from R instead of Rot."""
+    folder = RIGS / "easymocap_mirrored"
+    rig, said = imported("easymocap_mirrored", sizes={"": (1920, 1080)})
+    assert rig.names == ("2", "3", "4", "5", "6", "7")
+    assert any("all cameras look at one place" in line for line in said)
+    assert any("metres are plausible" in line for line in said)
+    files = [cv2.FileStorage(str(folder / name), cv2.FILE_STORAGE_READ) for name in ("intri.yml", "extri.yml")]
+    points = np.array([[0.1, -0.2, 0.9], [-0.4, 0.3, 1.7]])
+    for camera in rig.cameras:
+        K, dist = (files[0].getNode(f"{key}_{camera.name}").mat() for key in ("K", "dist"))
+        R, T = (files[1].getNode(f"{key}_{camera.name}").mat() for key in ("R", "T"))
+        expected = cv2.projectPoints(points, R, T, K, dist)[0][:, 0]
+        np.testing.assert_allclose(camera.world_to_image(points)[0], expected, atol=1e-6)
+        assert 1.0 < centre(camera)[2] < 2.0
 
 
 def test_easymocap_worked_by_hand():

@@ -117,7 +117,7 @@ def _directed(reading: Reading, wishes: Wishes, said: list[str]) -> list[Array]:
         said.append(f"direction: {chosen}, as you said; {_describe(look)}")
     elif look.common and not (reverse.common and reverse.miss < 0.5 * look.miss):
         said.append(f"direction: {chosen}, as the format documents; so read, {_describe(look)}")
-    elif look.parallel and (look.depths > 0).any():
+    elif look.parallel:
         said.append(f"direction: {chosen}, as the format documents; the cameras look the same way: nothing confirms it")
     else:
         raise RigError(
@@ -251,8 +251,10 @@ def _levelled(
     shift = np.eye(4)
     shift[2, 3] = -floor
     if declared == "cameras":
-        shift[:2, 3] = -where_they_look(levelled).point[:2]
-        said.append("origin: below the place that the cameras look at")
+        look = where_they_look(levelled)
+        middle = np.mean([T[:3, 3] for T in levelled], axis=0)
+        shift[:2, 3] = -(middle if look.parallel else look.point)[:2]
+        said.append(f"origin: below {'the cameras' if look.parallel else 'the place that the cameras look at'}")
     return [shift @ T for T in levelled]
 
 
