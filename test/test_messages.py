@@ -10,6 +10,7 @@ from array import array
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2, PointField
 from std_msgs.msg import Header
 from visualization_msgs.msg import Marker
@@ -512,6 +513,19 @@ def test_transform_of_a_quarter_turn() -> None:
     msg.transform.rotation.w = 0.0
     with pytest.raises(InputError, match="quaternion of length 1"):
         messages.message_to_transform(msg)
+
+
+def test_quaternions_are_scipys() -> None:
+    turns = Rotation.random(50, random_state=0)
+    half_turns = Rotation.from_rotvec(np.pi * np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [0.6, 0, -0.8], [0, 0, 0]]))
+    for rotation in (*turns, *half_turns):
+        q = np.array(messages.quaternion(rotation.as_matrix()))
+        theirs = rotation.as_quat()
+        assert min(np.abs(q - theirs).max(), np.abs(q + theirs).max()) < 1e-12
+        T = np.eye(4)
+        T[:3, :3] = rotation.as_matrix()
+        back = messages.message_to_transform(messages.transform_to_message(T, "a", HEADER))
+        assert np.abs(back - T).max() < 1e-12
 
 
 def test_status_values_and_worst_level() -> None:

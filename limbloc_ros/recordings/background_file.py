@@ -12,8 +12,8 @@ import numpy as np
 
 from limbloc_ros.core.background import BackgroundModel
 from limbloc_ros.core.errors import InputError
+from limbloc_ros.core.files import replaced
 from limbloc_ros.recordings.npz_file import read_npz
-from limbloc_ros.recordings.results import make_folder, replace_file
 
 
 def save_background(model: BackgroundModel, path: Path) -> None:
@@ -24,8 +24,8 @@ def save_background(model: BackgroundModel, path: Path) -> None:
     """
     state = model.state()
     if state is not None:
-        make_folder(path.parent)
-        replace_file(path, lambda file: np.savez(file, **state))  # type: ignore[arg-type]
+        with replaced(path) as temporary:
+            np.savez(temporary, **state)  # type: ignore[arg-type]
 
 
 def load_background(model: BackgroundModel, path: Path) -> None:

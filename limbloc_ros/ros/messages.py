@@ -15,7 +15,6 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Point, PoseArray, Quaternion, TransformStamped, Vector3
 from geometry_msgs.msg import Pose as PoseMsg
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import JointState
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
@@ -152,8 +151,8 @@ def _points(points: Array) -> list[Point]:
 
 def transform_to_message(T_parent_child: ArrayLike, child: str, header: Header) -> TransformStamped:
     """[4, 4] pose of `child` in the header's frame."""
-    T = np.array(T_parent_child, dtype=np.float64)  # a copy: SciPy 1.11 (Ubuntu 24.04) takes no read-only arrays
-    x, y, z, w = (float(q) for q in Rotation.from_matrix(T[:3, :3]).as_quat())
+    T = np.asarray(T_parent_child, dtype=np.float64)
+    x, y, z, w = quaternion(T[:3, :3])
     msg = TransformStamped(header=header, child_frame_id=child)
     msg.transform.translation = Vector3(x=float(T[0, 3]), y=float(T[1, 3]), z=float(T[2, 3]))
     msg.transform.rotation = Quaternion(x=x, y=y, z=z, w=w)
@@ -175,9 +174,33 @@ def message_to_transform(msg: TransformStamped) -> Array:
             f"length 1, got {numbers.tolist()}"
         )
     T = np.eye(4)
-    T[:3, :3] = Rotation.from_quat(numbers[3:]).as_matrix()
+    x, y, z, w = numbers[3:] / length
+    T[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
     T[:3, 3] = numbers[:3]
     return T
+
+
+def quaternion(R: Array) -> tuple[float, float, float, float]:
+    """Rotation matrix [3, 3] -> x, y, z, w of length 1 (Shepperd 1978).
+
+    SciPy has it too, but importing `scipy.spatial` takes a quarter of a second in the start of every process.
+    """
+    trace = float(np.trace(R))
+    # The largest of the four comes from a sum without cancellation, the others from it.
+    i = int(np.argmax([R[0, 0], R[1, 1], R[2, 2], trace]))
+    q = np.empty(4)
+    if i == 3:
+        q[:] = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1], 1 + trace
+    else:
+        j, k = (i + 1) % 3, (i + 2) % 3
+        q[i], q[j], q[k] = 1 + 2 * R[i, i] - trace, R[j, i] + R[i, j], R[k, i] + R[i, k]
+        q[3] = R[k, j] - R[j, k]
+    x, y, z, w = (q / np.linalg.norm(q)).tolist()
+    return x, y, z, w
 
 
 # --- diagnostics ---

@@ -10,12 +10,12 @@ import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import cv2
 import numpy as np
 from geometry_msgs.msg import TransformStamped
 from numpy.typing import NDArray
 from rclpy.node import Node
 from rclpy.time import Time
-from scipy.spatial.transform import Rotation
 from std_msgs.msg import Header
 
 from limbloc_ros.core.errors import RigError
@@ -88,15 +88,24 @@ def link_transforms(urdf: str, angles: Mapping[str, float], header: Header) -> l
         attributes = {} if origin is None else origin.attrib
         T = np.eye(4)
         T[:3, 3] = _numbers(attributes.get("xyz", "0 0 0"))
-        rotation = Rotation.from_euler("xyz", _numbers(attributes.get("rpy", "0 0 0")))
+        roll, pitch, yaw = _numbers(attributes.get("rpy", "0 0 0"))
+        R = _turn(_Z * yaw) @ _turn(_Y * pitch) @ _turn(_X * roll)
         if joint.attrib["type"] != "fixed":
             axis = joint.find("axis")
             direction = _numbers("1 0 0" if axis is None else axis.attrib["xyz"])
-            rotation = rotation * Rotation.from_rotvec(angles[joint.attrib["name"]] * direction)
-        T[:3, :3] = rotation.as_matrix()
+            R = R @ _turn(angles[joint.attrib["name"]] * direction)
+        T[:3, :3] = R
         parent, child = (joint.find(tag).attrib["link"] for tag in ("parent", "child"))  # type: ignore[union-attr]
         result.append(transform_to_message(T, child, Header(stamp=header.stamp, frame_id=parent)))
     return result
+
+
+_X, _Y, _Z = np.eye(3)
+
+
+def _turn(vector: Array) -> Array:
+    """Rotation vector [3], rad -> rotation matrix [3, 3]."""
+    return np.asarray(cv2.Rodrigues(vector)[0])
 
 
 def _numbers(text: str) -> Array:
