@@ -10,7 +10,6 @@ import threading
 from pathlib import Path
 
 import pytest
-import yaml
 from geometry_msgs.msg import PoseArray
 from rclpy.serialization import deserialize_message
 from ros_graph import Graph
@@ -174,18 +173,6 @@ def test_the_layout_shows_what_its_labels_say():
         index = int(re.fullmatch(r"/joints\.poses\[(\d+)\]\.position\.z", path["value"])[1])
         side, _, joint = path["label"].rpartition(" ")
         assert JOINT_NAMES[index] == (f"{joint}_{sides[side]}" if side else "head_centre")
-
-
-def test_rviz_shows_topics_that_there_are():
-    config = yaml.safe_load((ROOT / "config" / "limbloc.rviz").read_text())
-    displays = config["Visualization Manager"]["Displays"]
-    assert len({display["Name"] for display in displays}) == len(displays)
-    ours = {topics.HULL, topics.SURFACE, topics.JOINTS, topics.MARKERS, topics.TRUE_JOINTS, topics.body_urdf("p1")}
-    for display in displays:
-        for key in ("Topic", "Description Topic"):
-            if key in display:
-                name = display[key]["Value"].lstrip("/")
-                assert name in ours | {topics.image("cam0"), topics.mask("cam0")}, name
 
 
 def test_the_plan_has_the_bridge_when_asked_for(tmp_path):

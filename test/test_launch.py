@@ -10,14 +10,11 @@ from dataclasses import fields
 from pathlib import Path
 
 import pytest
-import yaml
 
 import limbloc_ros
 from limbloc_ros.nodes.composed import KINDS, flatten
 from limbloc_ros.nodes.graph_plan import NODE_SECTIONS, SmartSpaceConfig
 from limbloc_ros.rig.rig_file import load_rig
-from limbloc_ros.ros import topics
-from limbloc_ros.ros.cloud_messages import SURFACE_POINT
 from limbloc_ros.ros.environment import share_folder
 
 ROOT = Path(limbloc_ros.__file__).parent.parent
@@ -102,13 +99,3 @@ def test_the_dds_profile_is_the_default_one_with_large_segments(name):
     assert int(shared[0].findtext("d:maxMessageSize", "0", space)) == 4 * 2**20
     participant = root.find(".//d:participant", space)
     assert participant is not None and participant.get("is_default_profile") == "true"
-
-
-@pytest.mark.parametrize("topic", [topics.HULL, topics.SURFACE, topics.MARKERS, topics.TRUE_JOINTS])
-def test_rviz_shows_topics_that_exist(topic):
-    view = yaml.safe_load((CONFIG / "limbloc.rviz").read_text(encoding="utf-8"))["Visualization Manager"]
-    shown = {d["Topic"]["Value"] for d in view["Displays"] if "Topic" in d}
-    assert f"/{topic}" in shown
-    channels = {d["Channel Name"] for d in view["Displays"] if "Channel Name" in d}
-    assert channels <= set(SURFACE_POINT.names)
-    assert view["Global Options"]["Fixed Frame"] == "room"
