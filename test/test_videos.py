@@ -1,15 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
 """Videos and image folders: what is found, how frames are numbered, what is said of gaps and damage."""
 
+import dataclasses
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
 
 from limbloc_ros.core.camera import Camera, Rig
 from limbloc_ros.core.config import BackgroundConfig
-from limbloc_ros.core.errors import InputError
+from limbloc_ros.core.errors import InputError, NoPerson
+from limbloc_ros.export.recording import open_recording
+from limbloc_ros.recordings.batch import save_folder
 from limbloc_ros.recordings.folder_source import FolderSource, silhouette
-from limbloc_ros.recordings.open_source import background_pictures
+from limbloc_ros.recordings.kept_frames import KeptFrames
+from limbloc_ros.recordings.offline import OfflineConfig
+from limbloc_ros.recordings.open_source import background_pictures, open_source
+from limbloc_ros.recordings.results import FrameResult, Run
 from limbloc_ros.recordings.videos import ImageFolder, Video, find_streams, read_picture
 
 WIDTH, HEIGHT = 64, 48
@@ -224,6 +232,30 @@ def test_the_room_is_taken_from_a_picture(tmp_path):
     config = {"a": BackgroundConfig(min_blob_px=20)}
     sets = list(FolderSource(tmp_path / "video", rig, config, pictures).mask_sets())
     assert all(square_found(s.masks["a"], i) for i, s in enumerate(sets))
+
+
+def test_a_run_keeps_all_it_takes_to_read_its_recording_again(tmp_path, monkeypatch):
+    wall = write_walk(tmp_path / "video" / "a")
+    (tmp_path / "empty").mkdir()
+    cv2.imwrite(str(tmp_path / "empty" / "a.png"), wall)
+    config = OfflineConfig(background=BackgroundConfig(min_blob_px=20))
+    monkeypatch.chdir(tmp_path)  # named from here, found from elsewhere
+    source = open_source(Path("video"), make_rig("a"), config, background="empty", fps=50.0)
+    about = {**source.about, "config": dataclasses.asdict(config)}
+    sets = list(source.mask_sets())
+    frames = tuple(FrameResult(s.stamp_ns, NoPerson("not fitted")) for s in sets)
+    save_folder(Run(frames, about), source.rig, KeptFrames(), tmp_path / "out")
+    monkeypatch.chdir("/")
+    run = Run.load(tmp_path / "out")
+    again = open_recording(run, tmp_path / "out")
+    assert again.identity == source.identity
+    for before, after in zip(sets, again.mask_sets(), strict=True):
+        assert before.stamp_ns == after.stamp_ns
+        np.testing.assert_array_equal(before.masks["a"], after.masks["a"])
+    (tmp_path / "empty").rename(tmp_path / "moved")
+    with pytest.raises(InputError, match=r"--background .*empty: expected a folder with a picture per camera"):
+        open_recording(run, tmp_path / "out")
+    assert open_recording(run, tmp_path / "out", background=str(tmp_path / "moved")).identity == source.identity
 
 
 def test_the_room_is_guessed_from_a_recording_with_somebody_in_it(tmp_path):

@@ -72,7 +72,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--names", choices=tuple(MARKER_SETS), help="markers' names (trc: pose2sim, c3d: limbloc)")
     parser.add_argument("--recording", type=Path, help="video, ply: the bag, folder or case, if it has been moved")
     parser.add_argument(
-        "--background", metavar="DIR", help="ply of a recording: pictures of the empty room, as in `process`"
+        "--background", metavar="DIR", help="ply of a recording: pictures of the empty room, if they have been moved"
     )
     parser.add_argument("--width", type=int, default=480, metavar="PX", help="video: of a panel (default: 480)")
     parser.add_argument("--columns", type=int, default=0, metavar="N", help="video: panels in a row (default: fits)")

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import shlex
 import sys
 import time
 from pathlib import Path
@@ -15,12 +16,13 @@ from tqdm import tqdm
 from limbloc_ros.core.config import from_mapping
 from limbloc_ros.core.errors import ConfigError, InputError
 from limbloc_ros.recordings import offline
+from limbloc_ros.recordings.batch import save_folder
 from limbloc_ros.recordings.config_file import load_config
 from limbloc_ros.recordings.kept_frames import KeptFrames
 from limbloc_ros.recordings.offline import OfflineConfig
 from limbloc_ros.recordings.open_source import open_source
 from limbloc_ros.recordings.results import Run
-from limbloc_ros.rig.rig_file import load_rig, save_rig
+from limbloc_ros.rig.rig_file import load_rig
 
 DESCRIPTION = """\
 Work out the pose in every frame of a recording, on all cores, with the code of the live nodes.
@@ -140,12 +142,10 @@ def run(args: argparse.Namespace) -> int:
         )
     if only_joints:
         result.save_joints(out)
+        offline.forget_partial(partial)
     else:
-        result.about["command"] = "limbloc " + " ".join(sys.argv[1:])
-        result.save(out)
-        save_rig(source.rig, out / "rig.yaml")
-        kept.save(out)
-    offline.forget_partial(partial)
+        result.about["command"] = shlex.join(["limbloc", *sys.argv[1:]])
+        save_folder(result, source.rig, kept, out)
     print(summary(result, out, time.monotonic() - started))
     if args.report:
         from limbloc_ros.commands.report import make_report

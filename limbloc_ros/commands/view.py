@@ -27,7 +27,7 @@ Keys: left and right step, space plays, home and end go to the ends; drag turns,
 EPILOG = """\
 examples:
   limbloc view out/walk
-  limbloc view out/walk --recording videos/ --background empty_room/
+  limbloc view out/walk --recording videos/
   limbloc view out/walk --frame 28 --show hull sticks cameras --picture walk.png     no window, one picture
 """
 
@@ -39,7 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--show", nargs="+", choices=tuple(LAYERS), metavar="LAYER", help=f"of {', '.join(LAYERS)}")
     parser.add_argument("--colour", choices=COLOURS, default=COLOURS[0], help="of the hull (default: plain)")
     parser.add_argument("--recording", type=Path, help="read the masks of all frames from the bag, folder or case")
-    parser.add_argument("--background", metavar="DIR", help="pictures of the empty room, as in `limbloc process`")
+    parser.add_argument("--background", metavar="DIR", help="pictures of the empty room, if they have been moved")
     parser.add_argument("--picture", type=Path, metavar="FILE", help="write one picture instead of opening a window")
 
 

@@ -103,7 +103,13 @@ class Camera:
         object.__setattr__(self, "ignore", polygons)
         R = self.T_world_camera[:3, :3]
         if np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0:
-            raise RigError(f"camera {self.name}: the rotation of T_world_camera is not a right-handed rotation matrix")
+            raise RigError(
+                f"camera {self.name}: the rotation of T_world_camera is not a right-handed rotation matrix: its "
+                f"determinant is {np.linalg.det(R):.3f} (expected 1; -1: mirrored, of left-handed axes), "
+                f"its rows are {', '.join(f'{n:.3f}' for n in np.linalg.norm(R, axis=1))} long (expected 1); write its "
+                "columns as the image's right, down and forward in the room, or take the rig from the tool that "
+                "measured it with `limbloc rig import`"
+            )
 
     @property
     def T_camera_world(self) -> Array:

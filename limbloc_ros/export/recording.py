@@ -46,7 +46,7 @@ def open_recording(run: Run, folder: Path, recording: Path | None = None, backgr
         run: the results.
         folder: where they are.
         recording: where the recording is now, if it is not where it was.
-        background: as `limbloc process --background`; only for those who need masks of videos or images.
+        background: as `limbloc process --background`, if it is not where it was.
 
     Raises:
         InputError: the recording is gone, or cannot be read.
@@ -62,7 +62,7 @@ def open_recording(run: Run, folder: Path, recording: Path | None = None, backgr
         path,
         rig_of(folder),
         config_of(run),
-        background=background,
+        background=background or run.about.get("background_from"),
         masks=kind == "silhouettes",
         fps=float(run.about["fps"]) if folder_kind and "fps" in run.about else None,
     )

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from limbloc_ros.core.camera import Rig
 from limbloc_ros.core.errors import InputError
 from limbloc_ros.recordings.npz_file import read_npz
-from limbloc_ros.rig.plain_values import json_values
+from limbloc_ros.rig.plain_values import read_values
 from limbloc_ros.rig.rig_file import load_rig
 
 Array = NDArray[np.float64]
@@ -123,12 +123,7 @@ def load_case(folder: str | Path, rig: Rig | None = None) -> Case:
 def _read_meta(path: Path) -> dict[str, Any]:
     if not path.is_file():
         return {}
-    try:
-        meta = json_values(path.read_text(encoding="utf-8"))
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: not valid JSON: {error}") from None
-    except ValueError as error:
-        raise InputError(f"{path}{error}") from None
+    meta = read_values(path, "case", "the meta.json in it", InputError)
     if not isinstance(meta, dict):
         raise InputError(f"{path}: expected an object with keys such as kind and fps, got {type(meta).__name__}")
     if not isinstance(meta.get("fps", DEFAULT_FPS), (int, float)) or meta.get("fps", DEFAULT_FPS) <= 0:

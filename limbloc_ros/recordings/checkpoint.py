@@ -13,7 +13,7 @@ from typing import Any
 
 from limbloc_ros.core.errors import InputError, OutputError
 from limbloc_ros.recordings.results import FrameResult, load_frames, replace_file, save_frames, with_others
-from limbloc_ros.rig.plain_values import json_values
+from limbloc_ros.rig.plain_values import read_values
 
 #: Results are written down after this many frames or seconds, whichever comes first.
 FLUSH_FRAMES, FLUSH_S = 50, 10.0
@@ -97,10 +97,7 @@ def _chunk(folder: Path, first: int) -> Path:
 
 def _read_state(path: Path) -> dict[str, Any]:
     """Raises InputError when it is missing or damaged."""
-    try:
-        state = json_values(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path} cannot be read: {error}") from None
+    state = read_values(path, "state", "the .json in it", InputError)
     if not isinstance(state, dict):
         raise InputError(f"{path}: expected a mapping")
     return state

@@ -10,7 +10,7 @@ from typing import Any
 from limbloc_ros.core.config import BackgroundConfig, FitConfig, HullConfig, SyncConfig, from_mapping
 from limbloc_ros.core.errors import ConfigError
 from limbloc_ros.recordings.offline import OfflineConfig
-from limbloc_ros.rig.plain_values import yaml_values
+from limbloc_ros.rig.plain_values import read_values
 
 #: Where the method's parameters stand in the file; all else in it is about nodes and processes.
 SECTIONS: dict[str, tuple[str, type[Any]]] = {
@@ -52,12 +52,7 @@ def load_config(path: Path | None) -> OfflineConfig:
     """
     if path is None:
         return OfflineConfig()
-    try:
-        values = yaml_values(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"parameters file {path} cannot be read: {error}") from None
-    except ValueError as error:
-        raise ConfigError(f"parameters file {path}{error}") from None
+    values = read_values(path, "parameters file", "a YAML such as config/smart_space.yaml", ConfigError)
     try:
         return config_from_mapping({} if values is None else values)
     except ConfigError as error:

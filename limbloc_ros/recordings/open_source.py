@@ -43,6 +43,17 @@ def open_source(
         InputError: there is nothing, or nothing that can be read; or an option that this kind of input cannot use.
         RigError: a case's calib.json is malformed.
     """
+    source = _open(path, rig, config, background, masks, fps)
+    # What it takes to open it again from elsewhere; parameters and rig are kept beside it.
+    source.about["input"] = str(path.absolute())
+    if background is not None:
+        source.about["background_from"] = background if background == ESTIMATE else str(Path(background).absolute())
+    return source
+
+
+def _open(
+    path: Path, rig: Rig | None, config: OfflineConfig, background: str | None, masks: bool, fps: float | None
+) -> Source:
     if not path.exists():
         raise InputError(f"{path} does not exist; expected a bag, a folder of videos or images, or a benchmark case")
     if path.is_dir() and is_case(path):

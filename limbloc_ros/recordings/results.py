@@ -35,7 +35,7 @@ from limbloc_ros.core.errors import InputError, NoPerson, OutputError
 from limbloc_ros.core.people import Body
 from limbloc_ros.core.pose import JOINT_NAMES, Flesh, Pose
 from limbloc_ros.recordings.npz_file import read_npz
-from limbloc_ros.rig.plain_values import json_values
+from limbloc_ros.rig.plain_values import read_values
 
 Array = NDArray[np.float64]
 
@@ -334,12 +334,7 @@ def _read_about(path: Path) -> dict[str, Any]:
     """`run.json`; {} without one."""
     if not path.is_file():
         return {}
-    try:
-        about = json_values(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} cannot be read: {error}") from None
-    except ValueError as error:
-        raise InputError(f"{path}{error}") from None
+    about = read_values(path, "run's description", "the run.json in it", InputError)
     config = about.get("config", {}) if isinstance(about, dict) else None
     if not isinstance(config, dict) or not all(isinstance(section, dict) for section in config.values()):
         raise InputError(f"{path}: expected what was run, with its config by sections; run `process` again")

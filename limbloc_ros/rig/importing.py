@@ -104,7 +104,9 @@ def _directed(reading: Reading, wishes: Wishes, said: list[str]) -> list[Array]:
         if np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0:
             raise RigError(
                 f"{reading.source}: camera {camera.name}: its rotation has determinant {np.linalg.det(R):.3f} and rows "
-                f"of length {np.linalg.norm(R, axis=1).round(3).tolist()}; expected a right-handed rotation"
+                f"of length {np.linalg.norm(R, axis=1).round(3).tolist()}; expected a right-handed rotation. Was the "
+                "file edited, or written by a program whose axes are left-handed? Export it again, or measure the "
+                "cameras with `limbloc rig calibrate`"
             )
     ways = {CAMERA_TO_WORLD: matrices, WORLD_TO_CAMERA: [inverse(T) for T in matrices]}
     chosen = wishes.direction or reading.direction

@@ -17,7 +17,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from limbloc_ros.core.errors import RigError
+from limbloc_ros.core.errors import LimblocError, RigError
 
 Array = NDArray[np.float64]
 
@@ -28,40 +28,43 @@ MOST_VALUES, MOST_DEPTH = 1_000_000, 50
 LARGEST_NUMBER = 1e12
 
 
-def read_text(path: Path, what: str, expected: str) -> str:
+def read_values(path: Path, what: str, expected: str, error: type[LimblocError] = RigError) -> Any:
+    """The plain values of a YAML or JSON file; arguments and errors as of `read_text`, and of `parse`."""
+    return parse(read_text(path, what, expected, error), path, what, error)
+
+
+def read_text(path: Path, what: str, expected: str, error: type[LimblocError] = RigError) -> str:
     """A UTF-8 text file.
 
     Args:
         path: the file.
         what: how messages call it, e.g. `rig file`.
         expected: what to name instead when it is a folder.
-
-    Raises:
-        RigError: it is missing, a folder, unreadable or no text.
+        error: the kind to raise when it is missing, a folder, unreadable or no text.
     """
     if path.is_dir():
-        raise RigError(f"{what} {path}: expected a file, this is a folder; name {expected}")
+        raise error(f"{what} {path}: expected a file, this is a folder; name {expected}")
     try:
         return path.read_text(encoding="utf-8")
     except FileNotFoundError:
-        raise RigError(f"{what} {path} does not exist; check the path") from None
-    except UnicodeDecodeError as error:
-        raise RigError(f"{what} {path}: expected UTF-8 text, got other bytes at position {error.start}") from None
-    except OSError as error:
-        raise RigError(f"{what} {path} cannot be read: {error.strerror}") from None
+        raise error(f"{what} {path} does not exist; check the path") from None
+    except UnicodeDecodeError as cause:
+        raise error(f"{what} {path}: expected UTF-8 text, got other bytes at position {cause.start}") from None
+    except OSError as cause:
+        raise error(f"{what} {path} cannot be read: {cause.strerror}") from None
 
 
-def parse(text: str, path: Path, what: str) -> Any:
+def parse(text: str, path: Path, what: str, error: type[LimblocError] = RigError) -> Any:
     """Text -> plain values; YAML, or JSON by its file name (YAML refuses tabs, JSON reads faster).
 
     Raises:
-        RigError: what is wrong, and in which line.
+        LimblocError: of the kind `error`: what is wrong, and in which line.
     """
     is_json = path.suffix.lower() == ".json"
     try:
         return json_values(text) if is_json else yaml_values(text)
-    except ValueError as error:
-        raise RigError(f"{what} {path}{error}") from None
+    except ValueError as cause:
+        raise error(f"{what} {path}{cause}") from None
 
 
 #: Ten times as fast where PyYAML was built with libyaml.

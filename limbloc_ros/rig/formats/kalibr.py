@@ -26,7 +26,7 @@ from limbloc_ros.rig.formats.common import (
     only_file,
     row,
 )
-from limbloc_ros.rig.plain_values import kind, numbers, parse, read_text, required
+from limbloc_ros.rig.plain_values import kind, numbers, read_values, required
 
 _MODELS = {"radtan": "radtan", "equidistant": "fisheye", "none": "none"}
 
@@ -34,7 +34,7 @@ _MODELS = {"radtan": "radtan", "equidistant": "fisheye", "none": "none"}
 def read(paths: Sequence[Path]) -> Reading:
     """Read one camchain."""
     path = only_file(paths, "a Kalibr camchain")
-    data = parse(read_text(path, "camchain", "the camchain YAML in it"), path, "camchain")
+    data = read_values(path, "camchain", "the camchain YAML in it")
     if not isinstance(data, Mapping):
         raise RigError(f"camchain {path}: expected cam0, cam1, ..., got {kind(data)}")
     names = sorted((name for name in data if str(name).startswith("cam")), key=_number)

@@ -27,13 +27,13 @@ from limbloc_ros.rig.formats.common import (
     polynomial_model,
     pose_from_entry,
 )
-from limbloc_ros.rig.plain_values import flattened, kind, numbers, parse, read_text, required
+from limbloc_ros.rig.plain_values import flattened, kind, numbers, read_values, required
 
 
 def read(paths: Sequence[Path]) -> Reading:
     """Read one file."""
     path = only_file(paths, "multical's calibration.json")
-    data = parse(read_text(path, "multical file", "the calibration.json in it"), path, "multical file")
+    data = read_values(path, "multical file", "the calibration.json in it")
     entries = required(data, "cameras", str(path)) if isinstance(data, Mapping) else None
     if not isinstance(entries, Mapping) or not entries:
         raise RigError(f"{path}: key cameras: expected cameras by name, got {kind(entries)}")

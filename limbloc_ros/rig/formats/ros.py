@@ -23,7 +23,7 @@ from limbloc_ros.core.errors import RigError
 from limbloc_ros.core.files import write_text
 from limbloc_ros.rig.formats.common import CAMERA_TO_WORLD, Format, FoundCamera, Reading, row
 from limbloc_ros.rig.geometry import inverse
-from limbloc_ros.rig.plain_values import kind, numbers, parse, read_text, required, yaml_values
+from limbloc_ros.rig.plain_values import kind, numbers, read_text, read_values, required, yaml_values
 from limbloc_ros.rig.rig_file import MODEL_ALIASES
 
 Array = NDArray[np.float64]
@@ -45,7 +45,7 @@ def read(paths: Sequence[Path]) -> Reading:
 
 
 def _camera(path: Path) -> FoundCamera:
-    data = parse(read_text(path, "camera calibration", "the ost.yaml in it"), path, "camera calibration")
+    data = read_values(path, "camera calibration", "the ost.yaml in it")
     if not isinstance(data, Mapping):
         raise RigError(f"{path}: expected image_width, camera_matrix, ..., got {kind(data)}")
     name = str(data.get("camera_name", ""))
