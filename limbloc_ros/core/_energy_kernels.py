@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from limbloc_ros.core._figure_kernels import log_so3, part_bounds, part_distance
-from limbloc_ros.core._surface_fit_kernels import add_block, robust_weight
+from limbloc_ros.core._figure_kernels import log_so3, part_distance
+from limbloc_ros.core._surface_fit_kernels import SLACK, add_block, distance_to_part, lay_out, robust_weight
 
 #: How much more a negative amount of clothing costs than a positive one.
 TIGHT = 25.0
@@ -94,8 +94,8 @@ def inclusion_term(
 
     `samples` [M, 3] are barycentric weights within the parts `sample_parts` [M].
     """
-    v = np.zeros(12)
     grad = np.zeros(3)
+    away = -np.ones(4)
     cost = 0.0
     for m in range(len(samples)):
         p = sample_parts[m]
@@ -105,12 +105,9 @@ def inclusion_term(
             continue
         c, wd = robust_weight(e, width)
         cost += weight * c
-        for k in range(3):
-            v[4 * k] = samples[m, k] * grad[0]
-            v[4 * k + 1] = samples[m, k] * grad[1]
-            v[4 * k + 2] = samples[m, k] * grad[2]
-            v[4 * k + 3] = samples[m, k]
-        add_block(blocks[p], slopes[p], v, e, weight * wd)
+        for i in range(3):
+            away[i] = -grad[i]
+        add_block(blocks[p], slopes[p], samples[m], away, e, weight * wd)
     return cost
 
 
@@ -118,47 +115,44 @@ def inclusion_term(
 def gather(blocks: Any, slopes: Any, parts: Any, J: Any, A: Any, g: Any) -> None:
     """Multiply the parts' blocks by the figure's Jacobian [S, 4, P] and add them to A [P, P] and g [P].
 
-    A part moves with about half of the parameters (its own chain's), so the others are left out.
+    Blocks are complete on and above the diagonal of their 4 x 4 pieces. A = J' B J goes by way of B J, sphere by
+    sphere, and all inner loops run along rows, for the processor to take several parameters at a time.
     """
     n = A.shape[0]
-    column = np.empty(n, np.int64)
-    moves = np.empty((n, 12))
-    pushed = np.empty(12)
+    pushed = np.zeros(J.shape)
+    force = np.zeros((len(J), 4))
+    touched = np.zeros(len(J), np.bool_)
     for p in range(len(parts)):
-        if blocks[p, 3, 3] == 0.0 and blocks[p, 7, 7] == 0.0 and blocks[p, 11, 11] == 0.0:
+        block = blocks[p]
+        for k in range(3):
+            if block[4 * k + 3, 4 * k + 3] == 0.0:
+                continue
+            s = parts[p, k]
+            touched[s] = True
+            for i in range(4):
+                force[s, i] += slopes[p, 4 * k + i]
+            for m in range(3):
+                q = parts[p, m]
+                for i in range(4):
+                    a = 4 * k + i
+                    b = 4 * m
+                    if k <= m:
+                        b0, b1, b2, b3 = block[a, b], block[a, b + 1], block[a, b + 2], block[a, b + 3]
+                    else:
+                        b0, b1, b2, b3 = block[b, a], block[b + 1, a], block[b + 2, a], block[b + 3, a]
+                    for j in range(n):
+                        pushed[s, i, j] += b0 * J[q, 0, j] + b1 * J[q, 1, j] + b2 * J[q, 2, j] + b3 * J[q, 3, j]
+    for s in range(len(J)):
+        if not touched[s]:
             continue
-        count = 0
         for i in range(n):
-            some = False
-            for k in range(3):
-                for a in range(4):
-                    value = J[parts[p, k], a, i]
-                    moves[count, 4 * k + a] = value
-                    some |= value != 0.0
-            if some:
-                column[count] = i
-                count += 1
-        for i in range(12):
-            for j in range(i):
-                blocks[p, i, j] = blocks[p, j, i]
-        for i in range(count):
-            for a in range(12):
-                pushed[a] = 0.0
-            for b in range(12):
-                value = moves[i, b]
-                if value != 0.0:
-                    for a in range(12):
-                        pushed[a] += value * blocks[p, b, a]
-            at = column[i]
-            for a in range(12):
-                g[at] += moves[i, a] * slopes[p, a]
-            for j in range(i, count):
-                total = 0.0
-                for a in range(12):
-                    total += pushed[a] * moves[j, a]
-                A[at, column[j]] += total
-    # only the upper triangle was added to
-    for i in range(n):
+            x, y, z, r = J[s, 0, i], J[s, 1, i], J[s, 2, i], J[s, 3, i]
+            if x == 0.0 and y == 0.0 and z == 0.0 and r == 0.0:  # half of the parameters do not move this sphere
+                continue
+            g[i] += x * force[s, 0] + y * force[s, 1] + z * force[s, 2] + r * force[s, 3]
+            for j in range(i, n):
+                A[i, j] += x * pushed[s, 0, j] + y * pushed[s, 1, j] + z * pushed[s, 2, j] + r * pushed[s, 3, j]
+    for i in range(n):  # only the upper triangle was added to
         for j in range(i):
             A[i, j] = A[j, i]
 
@@ -350,20 +344,25 @@ def posture_term(
 
 @njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def xor_counts(sdf: Any, origin: Any, voxel: float, parts: Any, spheres: Any, radii: Any) -> tuple[int, int, int]:
-    """Voxels inside the hull only, inside the flesh only (anywhere in the world), and inside the hull (eq. 2)."""
-    bounds = part_bounds(parts, spheres, radii)
-    nx, ny, nz = sdf.shape
+    """Voxels inside the hull only, inside the flesh only (anywhere in the world), and inside the hull (eq. 2).
+
+    A distance changes by no more than the way travelled, and a part is convex: so in a column of voxels few distances
+    tell where it goes in and out.
+    """
+    rows, bounds = lay_out(parts, spheres, radii)
     low = np.zeros(3, np.int64)
-    high = np.array([nx, ny, nz])
+    high = np.array(sdf.shape)
     for p in range(len(parts)):
         for a in range(3):
-            low[a] = min(low[a], math.floor((bounds[p, a] - bounds[p, 3] - origin[a]) / voxel))
-            high[a] = max(high[a], math.ceil((bounds[p, a] + bounds[p, 3] - origin[a]) / voxel) + 1)
-    filled = np.zeros((high[0] - low[0], high[1] - low[1], high[2] - low[2]), np.uint8)
-    w = np.empty(3)
+            low[a] = min(low[a], math.floor((bounds[a, p] - bounds[3, p] - origin[a]) / voxel))
+            high[a] = max(high[a], math.ceil((bounds[a, p] + bounds[3, p] - origin[a]) / voxel) + 1)
+    filled = np.zeros((high[0] - low[0], high[1] - low[1], high[2] - low[2]), np.bool_)
+    no_ray = np.zeros(3)
+    first = np.empty(3, np.int64)
+    last = np.empty(3, np.int64)
+    flesh = 0
+    both = 0
     for p in range(len(parts)):
-        lo = np.empty(3, np.int64)
-        hi = np.empty(3, np.int64)
         for a in range(3):
             s0 = 1e9
             s1 = -1e9
@@ -371,33 +370,39 @@ def xor_counts(sdf: Any, origin: Any, voxel: float, parts: Any, spheres: Any, ra
                 s = parts[p, k]
                 s0 = min(s0, spheres[s, a] - radii[s])
                 s1 = max(s1, spheres[s, a] + radii[s])
-            lo[a] = math.ceil((s0 - origin[a]) / voxel) - low[a]
-            hi[a] = math.floor((s1 - origin[a]) / voxel) - low[a]
-        for i in range(lo[0], hi[0] + 1):
-            x = origin[0] + (i + low[0]) * voxel
-            for j in range(lo[1], hi[1] + 1):
-                y = origin[1] + (j + low[1]) * voxel
-                for k in range(lo[2], hi[2] + 1):
-                    if filled[i, j, k] == 0:
-                        z = origin[2] + (k + low[2]) * voxel
-                        if part_distance(x, y, z, parts[p], spheres, radii, w) < 0.0:
-                            filled[i, j, k] = 1
-    hull_only = 0
-    flesh = 0
-    both = 0
+            first[a] = math.ceil((s0 - origin[a]) / voxel)
+            last[a] = math.floor((s1 - origin[a]) / voxel)
+        for i in range(first[0], last[0] + 1):
+            x = origin[0] + i * voxel
+            for j in range(first[1], last[1] + 1):
+                y = origin[1] + j * voxel
+                half2 = bounds[3, p] ** 2 - (x - bounds[0, p]) ** 2 - (y - bounds[1, p]) ** 2
+                if half2 < 0.0:
+                    continue
+                middle = (bounds[2, p] - origin[2]) / voxel
+                half = math.sqrt(half2) / voxel + SLACK
+                k = max(first[2], math.ceil(middle - half))
+                end = min(last[2], math.floor(middle + half))
+                within = 0 <= i < sdf.shape[0] and 0 <= j < sdf.shape[1]
+                entered = False
+                while k <= end:
+                    if filled[i - low[0], j - low[1], k - low[2]]:
+                        k += 1
+                        continue
+                    d, _, _ = distance_to_part(rows[p], x, y, origin[2] + k * voxel, no_ray)
+                    steps = 1 + int(max(abs(d) - SLACK, 0.0) / voxel)
+                    if d < 0.0:
+                        entered = True
+                        for m in range(k, min(k + steps, end + 1)):
+                            if not filled[i - low[0], j - low[1], m - low[2]]:
+                                filled[i - low[0], j - low[1], m - low[2]] = True
+                                flesh += 1
+                                if within and 0 <= m < sdf.shape[2] and sdf[i, j, m] < 0.0:
+                                    both += 1
+                    elif entered:
+                        break
+                    k += steps
     hull = 0
-    for i in range(filled.shape[0]):
-        for j in range(filled.shape[1]):
-            for k in range(filled.shape[2]):
-                a = i + low[0]
-                b = j + low[1]
-                c = k + low[2]
-                inside = a >= 0 and b >= 0 and c >= 0 and a < nx and b < ny and c < nz and sdf[a, b, c] < 0.0
-                if inside:
-                    hull += 1
-                    if filled[i, j, k]:
-                        both += 1
-                if filled[i, j, k]:
-                    flesh += 1
-    hull_only = hull - both
-    return hull_only, flesh - both, hull
+    for value in sdf.ravel():
+        hull += value < 0.0
+    return hull - both, flesh - both, hull

@@ -11,7 +11,7 @@ from numba import njit
 
 from limbloc_ros.core._energy_kernels import blended_sphere, sample_sdf
 from limbloc_ros.core._figure_kernels import log_so3, part_bounds, part_distance
-from limbloc_ros.core._surface_fit_kernels import nearest_part, offset_from, robust_weight
+from limbloc_ros.core._surface_fit_kernels import lay_out, nearest_part, offset_from, robust_weight
 
 #: A candidate pays at most so much (m^2) for violated joint limits.
 MOST_FOR_LIMITS = 5e-5
@@ -132,7 +132,7 @@ def limb_fits(
     lower = np.empty(3)
     w = np.empty(3)
     away = np.empty(3)
-    scratch = np.empty((5, 3))
+    far = np.empty(len(limb_parts))
     for m in range(len(found)):
         n1 = 0.0
         n2 = 0.0
@@ -157,23 +157,10 @@ def limb_fits(
             R = first if limb_bones[n] == 0 else second
             for i in range(3):
                 spheres[s, i] = start[i] + R[i, 0] * offsets[n, 0] + R[i, 1] * offsets[n, 1] + R[i, 2] * offsets[n, 2]
-        bounds = part_bounds(limb_parts, spheres, radii)
+        rows, bounds = lay_out(limb_parts, spheres, radii)
         p = -1
         for q in range(len(query)):
-            gap, p = nearest_part(
-                query[q],
-                normals[q],
-                rays[q],
-                limb_parts,
-                bounds,
-                spheres,
-                radii,
-                surface[1],
-                body_gap[q],
-                p,
-                w,
-                scratch,
-            )
+            gap, p = nearest_part(query[q], normals[q], rays[q], rows, bounds, surface[1], body_gap[q], p, far, w)
             if p < 0:
                 gaps[m, q] = math.inf
                 costs[m, q] = 0.0
@@ -222,17 +209,15 @@ def limb_fits(
 @njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def body_fit(query: Any, normals: Any, rays: Any, parts: Any, spheres: Any, radii: Any, surface: Any) -> Any:
     """How well the given parts explain each point: gated distance [Q], m, and cost [Q], m^2; see `limb_fits`."""
-    bounds = part_bounds(parts, spheres, radii)
+    rows, bounds = lay_out(parts, spheres, radii)
     w = np.empty(3)
     away = np.empty(3)
-    scratch = np.empty((5, 3))
+    far = np.empty(len(parts))
     gaps = np.empty(len(query))
     costs = np.empty(len(query))
     p = -1
     for q in range(len(query)):
-        gaps[q], p = nearest_part(
-            query[q], normals[q], rays[q], parts, bounds, spheres, radii, surface[1], 1e9, p, w, scratch
-        )
+        gaps[q], p = nearest_part(query[q], normals[q], rays[q], rows, bounds, surface[1], 1e9, p, far, w)
         d = offset_from(query[q], rays[q], parts[p], w, spheres, radii, away)
         c, _ = robust_weight(d, surface[0])
         costs[q] = c * (surface[2] if d < 0.0 else 1.0)

@@ -53,43 +53,51 @@ def list_surface(sdf: NDArray[np.float32]) -> tuple[Ints, Ints]:
 
 
 @njit(cache=True)
-def list_neighbours(local: Ints, number: Ints, offsets: Ints) -> Ints:
-    """[N, 26] numbers of the surface voxels around each surface voxel, -1 where there is none."""
-    nx, ny, nz = number.shape
-    out = np.full((local.shape[0], offsets.shape[0]), -1, dtype=np.int32)
-    for n in range(local.shape[0]):
-        for m in range(offsets.shape[0]):
-            i, j, k = local[n, 0] + offsets[m, 0], local[n, 1] + offsets[m, 1], local[n, 2] + offsets[m, 2]
-            if 0 <= i < nx and 0 <= j < ny and 0 <= k < nz:
-                out[n, m] = number[i, j, k]
+def list_neighbours(indices: Ints, offsets: Ints) -> Ints:
+    """[N, 26] rows of the voxels around each voxel of the list, -1 where there is none."""
+    low = np.array([indices[:, a].min() - 1 for a in range(3)])
+    size = np.array([indices[:, a].max() + 2 for a in range(3)]) - low
+    number = np.full((size[0], size[1], size[2]), -1, dtype=np.int32)
+    for n in range(len(indices)):
+        number[indices[n, 0] - low[0], indices[n, 1] - low[1], indices[n, 2] - low[2]] = n
+    out = np.empty((len(indices), len(offsets)), dtype=np.int32)
+    for n in range(len(indices)):
+        i, j, k = indices[n, 0] - low[0], indices[n, 1] - low[1], indices[n, 2] - low[2]
+        for m in range(len(offsets)):
+            out[n, m] = number[i + offsets[m, 0], j + offsets[m, 1], k + offsets[m, 2]]
     return out
 
 
 @njit(cache=True)
-def label_components(neighbours: Ints) -> tuple[Ints, Ints]:
-    """Connected components of the neighbour graph: label [N], size per label."""
-    count = neighbours.shape[0]
-    label = np.full(count, -1, dtype=np.int32)
-    sizes = np.zeros(count, dtype=np.int32)
-    stack = np.empty(count, dtype=np.int32)
-    labels = 0
-    for start in range(count):
+def largest_component(local: Ints, number: Ints, offsets: Ints) -> Ints:
+    """The listed voxels [M, 3] of the largest connected piece, in the same order."""
+    nx, ny, nz = number.shape
+    label = np.full(len(local), -1, dtype=np.int32)
+    stack = np.empty(len(local), dtype=np.int32)
+    labels = best = most = 0
+    for start in range(len(local)):
         if label[start] >= 0:
             continue
         label[start] = labels
         stack[0] = start
         top = 1
+        size = 0
         while top > 0:
             top -= 1
             n = stack[top]
-            sizes[labels] += 1
-            for m in neighbours[n]:
-                if m >= 0 and label[m] < 0:
-                    label[m] = labels
-                    stack[top] = m
-                    top += 1
+            size += 1
+            for m in range(len(offsets)):
+                i, j, k = local[n, 0] + offsets[m, 0], local[n, 1] + offsets[m, 1], local[n, 2] + offsets[m, 2]
+                if 0 <= i < nx and 0 <= j < ny and 0 <= k < nz:
+                    other = number[i, j, k]
+                    if other >= 0 and label[other] < 0:
+                        label[other] = labels
+                        stack[top] = other
+                        top += 1
+        if size > most:
+            most, best = size, labels
         labels += 1
-    return label, sizes[:labels]
+    return local if labels == 1 else local[label == best]
 
 
 @njit(cache=True)

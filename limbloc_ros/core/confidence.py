@@ -36,9 +36,10 @@ def joint_sigma(state: FigureState, system: System, rivals: Rivals = ()) -> Arra
     hull nearly as well: an arm that may as well be elsewhere.
     """
     n = len(system.gradient)
-    covariance = np.linalg.inv(system.matrix + 1e-9 * np.trace(system.matrix) / n * np.eye(n))
-    J = figure.place_jacobian(state)[figure.N_SPHERES :, :3]
-    curved = np.maximum(np.einsum("jap,pq,jaq->j", J, covariance, J), 0.0)
+    information = system.matrix + 1e-9 * np.trace(system.matrix) / n * np.eye(n)
+    J = figure.place_jacobian(state)[figure.N_SPHERES :, :3].reshape(-1, n)
+    variances = (J * np.linalg.solve(information, J.T).T).sum(axis=1)
+    curved = np.maximum(variances.reshape(-1, 3).sum(axis=1), 0.0)
     joints = figure.place(state).joints
     weight, apart = 1.0, np.zeros(len(joints))
     for rival, ratio in rivals:

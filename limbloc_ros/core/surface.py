@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -29,16 +30,12 @@ class Surface:
         indices: int32 [N, 3] lattice indices of the surface voxels, in array order.
         points: [N, 3] m, world; the voxel centre pushed along its normal onto sdf = 0.
         normals: [N, 3] unit normals, outward.
-        curvature: [N] rad; mean angle between a voxel's normal and its neighbours' (0 on a plane).
-        neighbours: int32 [N, 26] rows of the neighbouring surface voxels, -1 where there is none.
     """
 
     voxel_m: float
     indices: NDArray[np.int32]
     points: Array
     normals: Array
-    curvature: Array
-    neighbours: NDArray[np.int32]
 
     def __len__(self) -> int:
         return len(self.points)
@@ -48,9 +45,19 @@ class Surface:
         """[N, 3] voxel centres, m, world."""
         return np.asarray((self.indices + 0.5) * self.voxel_m, dtype=np.float64)
 
+    @cached_property
+    def neighbours(self) -> NDArray[np.int32]:
+        """[N, 26] rows of the neighbouring surface voxels, -1 where there is none; worked out when first asked for."""
+        return np.asarray(kernels.list_neighbours(self.indices, kernels.OFFSETS))
+
+    @cached_property
+    def curvature(self) -> Array:
+        """[N] rad; mean angle between a voxel's normal and its neighbours' (0 on a plane; paper section 2.1)."""
+        return np.asarray(kernels.mean_neighbour_angle(self.normals, self.neighbours))
+
 
 def extract_surface(hull: Hull, *, volume: Literal["sdf", "occupancy"] = "sdf") -> Surface:
-    """The surface of `hull` with normals and curvature (paper section 2.1).
+    """The surface of `hull` with its normals (paper section 2.1).
 
     Args:
         hull: the visual hull.
@@ -64,8 +71,7 @@ def extract_surface(hull: Hull, *, volume: Literal["sdf", "occupancy"] = "sdf") 
     local, number = kernels.list_surface(sdf)
     if len(local) == 0:
         raise InputError("expected a hull with voxels inside (sdf < 0), got an empty one; check the masks and the rig")
-    neighbours = kernels.list_neighbours(local, number, kernels.OFFSETS)
-    local, neighbours = _largest_component(local, neighbours)
+    local = kernels.largest_component(local, number, kernels.OFFSETS)  # no specks, no inner walls of cavities
 
     filtered = sdf if volume == "sdf" else (sdf >= 0).astype(np.float32)
     normals = kernels.normalise_outward(kernels.sobel_at(filtered, local), sdf, local)
@@ -76,8 +82,6 @@ def extract_surface(hull: Hull, *, volume: Literal["sdf", "occupancy"] = "sdf") 
         indices=indices,
         points=(indices + 0.5 + steps[:, None] * normals) * hull.voxel_m,
         normals=normals,
-        curvature=kernels.mean_neighbour_angle(normals, neighbours),
-        neighbours=neighbours,
     )
 
 
@@ -95,16 +99,3 @@ def curvature_variability(surface: Surface, radius_m: float) -> tuple[Array, Arr
     """
     mean, deviation = kernels.spread_in_ball(surface.curvature, surface.points, surface.neighbours, float(radius_m))
     return mean, deviation
-
-
-def _largest_component(
-    local: NDArray[np.int32], neighbours: NDArray[np.int32]
-) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Drop all but the largest connected piece: specks, and the inner walls of cavities."""
-    label, sizes = kernels.label_components(neighbours)
-    if len(sizes) == 1:
-        return local, neighbours
-    keep = label == np.argmax(sizes)
-    row = np.cumsum(keep, dtype=np.int32) - 1
-    kept = neighbours[keep]
-    return local[keep], np.where(kept >= 0, row[kept], np.int32(-1)).astype(np.int32)
