@@ -108,7 +108,7 @@ def test_fisheye_and_rational_lenses():
         for c in default_rig(3, 1280, 960).cameras
     )
     rig = Rig(cameras, np.zeros(3), np.ones(3))
-    views = rig_boards.project(rig, BOARD, rig_boards.walk(BOARD, 80, 10, rng), 0.1, rng)
+    views = rig_boards.project(rig, BOARD, rig_boards.walk(BOARD, 50, 8, rng), 0.1, rng)
     near = rig_boards.near(rig, BOARD, 15, 0.1, rng)
     result = calibrate(rig.names, sizes(rig), views, BOARD, lens="fisheye", lens_views=near)
     place, turn = errors(rig.cameras, result.cameras)

@@ -183,22 +183,28 @@ def adjust(bundle: Bundle, views: Sequence[View], points: Array, reference: int)
     # In variables that whiten the first guess's normal equations, a few steps do in place of hundreds.
     start = layout.pack()
     residuals, J = evaluate(start)
-    normal, _ = _normal_equations(residuals, J)
-    scale = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-12))
-    factor = np.linalg.cholesky(normal * np.outer(scale, scale) + 1e-9 * np.eye(layout.size))
+    scale, factor = _whitening(_normal_equations(residuals, J)[0])
+    last = (np.zeros(layout.size), residuals, J)
+
+    def at(y: Array) -> tuple[list[Array], csr_matrix]:
+        """Where the derivatives are asked for, the residuals were asked for just before."""
+        nonlocal last
+        if not np.array_equal(last[0], y):
+            last = (y.copy(), *evaluate(start + unwhitened(y)))
+        return last[1:]
 
     def unwhitened(y: Array) -> Array:
-        return np.asarray(scale * solve_triangular(factor, y, lower=True, trans=1))
+        return np.asarray(scale * solve_triangular(factor, y, lower=True, trans=1, check_finite=False))
 
     def cost(y: Array) -> Array:
-        return np.concatenate([residual.ravel() for residual in evaluate(start + unwhitened(y))[0]])
+        return np.concatenate([residual.ravel() for residual in at(y)[0]])
 
     def jacobian(y: Array) -> LinearOperator:
-        J = evaluate(start + unwhitened(y))[1]
+        J = at(y)[1]
         return LinearOperator(
             J.shape,
             matvec=lambda v: J @ unwhitened(v.ravel()),
-            rmatvec=lambda r: solve_triangular(factor, scale * (J.T @ r.ravel()), lower=True),
+            rmatvec=lambda r: solve_triangular(factor, scale * (J.T @ r.ravel()), lower=True, check_finite=False),
         )
 
     solution = least_squares(
@@ -215,13 +221,22 @@ def adjust(bundle: Bundle, views: Sequence[View], points: Array, reference: int)
         tr_solver="lsmr",
         tr_options={"atol": 1e-9, "btol": 1e-9},
     )
-    end = start + unwhitened(solution.x)
-    residuals, J = evaluate(end)
+    residuals, J = at(solution.x)
     normal, spread = _normal_equations(residuals, J)
-    covariance = np.asarray(np.linalg.pinv(normal, hermitian=True) * spread, dtype=np.float64)
-    adjusted = layout.unpack(end)
-    sigma = _camera_sigma(adjusted.cameras, layout, covariance)
+    adjusted = layout.unpack(start + unwhitened(solution.x))
+    motions = _camera_motions(adjusted.cameras, layout)
+    # The covariance is the inverse of the normal equations; only its part about the cameras is worked out.
+    scale, factor = _whitening(normal)
+    roots = solve_triangular(factor, scale[:, None] * motions.T, lower=True)
+    sigma = np.sqrt(spread * (roots**2).sum(axis=0)).reshape(-1, 6)
     return Adjusted(adjusted, residuals, sigma, int(solution.nfev))
+
+
+def _whitening(normal: Array) -> tuple[Array, Array]:
+    """Scale s [P] and lower factor L [P, P], with which (L^-1 s) (s L^-T) is the inverse of normal equations."""
+    scale = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-12))
+    ridge = 1e-9 * np.eye(len(normal))
+    return scale, np.asarray(np.linalg.cholesky(normal * np.outer(scale, scale) + ridge), dtype=np.float64)
 
 
 def _normal_equations(residuals: Sequence[Array], J: csr_matrix) -> tuple[Array, float]:
@@ -233,10 +248,11 @@ def _normal_equations(residuals: Sequence[Array], J: csr_matrix) -> tuple[Array,
     return (weighted.T @ weighted).toarray(), spread
 
 
-def _camera_sigma(cameras: Array, layout: _Layout, covariance: Array) -> Array:
-    """Standard deviations [C, 6] of the cameras' turns and centres among each other, whichever the reference was."""
+def _camera_motions(cameras: Array, layout: _Layout) -> Array:
+    """Derivatives [6 C, P] of the cameras' turns (rad) and centres (m) among each other, whichever the reference was,
+    by all parameters."""
     count = len(cameras)
-    J = np.zeros((6 * count, covariance.shape[0]))
+    J = np.zeros((6 * count, layout.size))
     motions = np.zeros((6 * count, 6))
     for c, (pose, at) in enumerate(zip(cameras, layout.camera_at, strict=True)):
         R, derivative = cv2.Rodrigues(pose[:3])
@@ -251,9 +267,7 @@ def _camera_sigma(cameras: Array, layout: _Layout, covariance: Array) -> Array:
         motions[6 * c + 3 : 6 * c + 6, 3:] = np.eye(3)
     centres = np.tile([0.0, 0, 0, 1, 1, 1], count)
     fit = np.linalg.pinv(motions * centres[:, None]) * centres
-    J -= motions @ (fit @ J)
-    variance = np.einsum("ij,jk,ik->i", J, covariance, J)
-    return np.asarray(np.sqrt(np.maximum(variance, 0)).reshape(count, 6))
+    return np.asarray(J - motions @ (fit @ J))
 
 
 def _vee(skew: Array) -> Array:
