@@ -30,12 +30,16 @@ $(STAMP): setup.py setup.cfg pyproject.toml requirements/$(ROS).lock tools/setup
 demo: setup
 	@$(RUN) -m limbloc_ros demo $(ARGS)
 
-# Calculations side by side, then what starts nodes and processes, one after the other, then
-# whole rooms. ARGS are pytest's.
+# What starts nodes and processes, one after the other; beside it, in the time that they wait, what only calculates
+# (its output comes after theirs); then whole rooms. ARGS are pytest's.
+CALCULATIONS := $(VENV)/calculations.log
 test: setup
 ifeq ($(ARGS),)
-	@$(RUN) -m pytest -q -n 2 --dist loadfile -m "not live and not room"
-	@$(RUN) -m pytest -q -m live
+	@nice -n 19 $(RUN) -m pytest -q -n 2 --dist loadfile -p no:cacheprovider -m "not live and not room" \
+	  > $(CALCULATIONS) 2>&1 & calculations=$$!; \
+	$(RUN) -m pytest -q -m live; live=$$?; \
+	wait $$calculations; calculated=$$?; cat $(CALCULATIONS); \
+	exit $$((live + calculated))
 	@$(RUN) -m pytest -q -m room
 else
 	@$(RUN) -m pytest $(ARGS)
@@ -59,7 +63,8 @@ fuzz: setup
 
 # Its tools are installed when the site is built for the first time.
 docs: setup
-	@$(RUN) -c 'import material, mkdocstrings_handlers.python' 2>/dev/null || $(RUN) -m pip install -qq -e '.[docs]'
+	@$(RUN) -c 'import material, mkdocstrings_handlers.python' 2>/dev/null || \
+	  $(RUN) -m pip install -qq --disable-pip-version-check --require-hashes -r requirements/docs.lock
 	@NO_MKDOCS_2_WARNING=1 $(RUN) -m mkdocs build --strict --quiet
 	@echo "the documentation is in site/index.html"
 

@@ -1,8 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """What holds for all tests."""
 
+import os
 import signal
 from pathlib import Path
+
+# One thread each, as the nodes of the graph have it (ros/environment.py): test processes run side by side, and BLAS's
+# threads would wait for each other. Before numpy is imported; processes that tests start inherit it.
+for library in ("OMP", "OPENBLAS"):
+    os.environ.setdefault(f"{library}_NUM_THREADS", "1")
 
 # A shell that runs the tests in the background has them ignore Ctrl-C, and all processes that they start would, too.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:

@@ -14,3 +14,7 @@ for ros in jazzy kilted; do
     --custom-compile-command "tools/lock_requirements.sh" --extra dev "$@" \
     "requirements/$ros.txt" requirements/build.txt setup.py --output-file "requirements/$ros.lock"
 done
+# What `make docs` adds to them.
+"$tools/bin/uv" pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-annotate \
+  --custom-compile-command "tools/lock_requirements.sh" --extra docs --constraint requirements/jazzy.lock "$@" \
+  setup.py --output-file requirements/docs.lock
