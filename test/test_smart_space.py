@@ -23,7 +23,9 @@ from limbloc_ros.nodes import composed, smart_space
 from limbloc_ros.nodes.graph_plan import SmartSpaceConfig, load_config, plan_graph
 from limbloc_ros.recordings.bags import BagReader, BagWriter
 from limbloc_ros.rig.rig_file import load_rig, save_rig
+from limbloc_ros.ros import supervisor as supervising
 from limbloc_ros.ros.environment import NetworkConfig, config_file, graph_environment
+from limbloc_ros.ros.process_starter import ProcessStarter, StartedProcess
 from limbloc_ros.ros.supervisor import ProcessConfig, ProcessPlan, Supervisor
 from limbloc_ros.simulation.room import default_rig
 
@@ -331,6 +333,27 @@ def test_a_killed_process_is_started_again_and_works(observer):
     assert all(gone(pid) for pid in (*before.values(), *after.values()))
 
 
+def test_what_the_server_forks_outlives_it_and_a_new_one_is_started(observer):
+    lines = Lines()
+    plans = [plan("cameras_1", segmentation("cam0")), plan("cameras_2", segmentation("cam1"))]
+    with Supervisor(plans, graph_environment(NETWORK), FAST, lines.append) as supervisor:
+        wait_until(lambda: supervisor.poll() and len(supervisor.pids) == 2)
+        before = supervisor.pids
+        me = psutil.Process()
+        assert {psutil.Process(pid).ppid() for pid in before.values()} == {me.pid}
+        (server,) = (
+            child
+            for child in me.children()
+            if "process_server" in " ".join(child.cmdline()[1:4]) and child.pid not in before.values()
+        )
+        assert server.num_threads() == 1
+        server.kill()
+        os.kill(before["cameras_1"], signal.SIGKILL)
+        wait_until(lambda: supervisor.poll() and supervisor.restarts["cameras_1"] == 1)
+        assert supervisor.pids["cameras_2"] == before["cameras_2"]
+        wait_until(lambda: {"segmentation_cam0", "segmentation_cam1"} <= set(observer.get_node_names()))
+
+
 def test_the_delay_grows_while_a_process_keeps_dying():
     lines = Lines()
     # A process that cannot even read its description dies with Python's exit code 1 each time.
@@ -374,16 +397,26 @@ time.sleep(60)
 """
 
 
+class StubbornStarter(ProcessStarter):
+    """Starts a process that ignores signals instead of the requested one."""
+
+    def request(self, key, name, description, variables, output):
+        actions = [(os.POSIX_SPAWN_DUP2, output, 1)]
+        command = [sys.executable, "-c", STUBBORN]
+        pid = os.posix_spawn(sys.executable, command, os.environ, file_actions=actions, setpgroup=0)
+        self.waiting = [(key, StartedProcess(pid))]
+
+    def started(self):
+        found, self.waiting = self.waiting, []
+        return found
+
+
 def test_a_process_that_ignores_signals_is_killed_with_its_children(monkeypatch):
     lines = Lines()
     config = ProcessConfig(interrupt_s=0.3, terminate_s=0.3)
+    monkeypatch.setattr(supervising, "ProcessStarter", StubbornStarter)
     supervisor = Supervisor([plan("stubborn", segmentation("cam0"))], {}, config, lines.append)
-    real = subprocess.Popen
-    monkeypatch.setattr(
-        subprocess, "Popen", lambda command, **options: real([sys.executable, "-c", STUBBORN], **options)
-    )
     supervisor.start()
-    monkeypatch.undo()
     lines.wait_for(supervisor, "stubborn")
     pid = supervisor.pids["stubborn"]
     wait_until(lambda: len(psutil.Process(pid).children()) == 1)
@@ -401,6 +434,7 @@ def start_smart_space(tmp_path):
     script = f"""
 import sys
 from limbloc_ros.ros.environment import NetworkConfig, graph_environment
+from limbloc_ros.ros.process_starter import ProcessStarter, StartedProcess
 from limbloc_ros.ros.supervisor import ProcessPlan, Supervisor
 def process(i):
     node = {{"kind": "segmentation", "name": f"segmentation_{{i}}", "parameters": {{"camera": f"cam{{i}}"}}}}

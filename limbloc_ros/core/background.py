@@ -19,6 +19,7 @@ A mask depends on the images given before and on nothing else.
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -489,6 +490,7 @@ class BackgroundModel:
         return False
 
 
+@functools.cache  # once per process
 def warm_up() -> None:
     """Compile or load the kernels, so that the first image is not slow."""
     config = dataclasses.replace(BackgroundConfig(), learning_frames=2, relearn_fraction=1.0)

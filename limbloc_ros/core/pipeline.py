@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import time
 from collections.abc import Mapping
 
@@ -54,6 +55,7 @@ class Carver:
         return carve_silhouettes(silhouettes, self.rig, self.config)
 
     @staticmethod
+    @functools.cache  # once per process
     def warm_up() -> None:
         """Compile or load the carving kernels, so that the first frame is not slow."""
         Carver(*_warm_up_room()).carve(_warm_up_masks())
@@ -98,6 +100,7 @@ class PoseEstimator:
         self._tracker.reset()
 
     @staticmethod
+    @functools.cache
     def warm_up() -> None:
         """Compile or load every kernel, so that the first frame is not slow."""
         hull = Carver(*_warm_up_room()).carve(_warm_up_masks())

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import functools
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -35,9 +34,6 @@ TICK_S = 0.02
 #: While some camera's process is behind, masks of one instant come far apart: then sets wait this long for the rest, s,
 #: until nothing has been skipped for some seconds.
 BEHIND_TIMEOUT_S, BEHIND_S = 1.0, 10.0
-
-#: Once per process, however many nodes are composed in it.
-warm_up = functools.cache(Carver.warm_up)
 
 
 @dataclass(frozen=True)
@@ -74,7 +70,7 @@ class CarvingNode(Node):
         self.rig_source: RigFromTopics | None = None
         self.synchroniser: StampSynchroniser[Pixels] | None = None
         self.skipped_s = -BEHIND_S
-        warm_up()
+        Carver.warm_up()
         self.backlog: Backlog[FrameSet[Pixels]] = Backlog(self, self.carve, self.settings.catch_up_s)
         self.hull = self.create_publisher(PointCloud2, topics.HULL, topics.STREAM_QOS)
         s = self.settings

@@ -53,13 +53,13 @@ ORPHAN_GRACE_S = 5.0
 _PR_SET_PDEATHSIG = 1
 
 
-def main() -> NoReturn:
+def main(argv: Sequence[str] | None = None) -> NoReturn:
     """The process: `run`, and then out at once.
 
     Nodes and DDS are shut down by then. What Python would still do, tearing down compiled kernels and the last DDS
     threads, was seen to hang for longer than anybody waits after Ctrl-C.
     """
-    code = run()
+    code = run(argv)
     sys.stdout.flush()
     sys.stderr.flush()
     os._exit(code)

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import functools
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -35,9 +34,6 @@ from limbloc_ros.ros.parameters import NodeParameters
 
 #: Longer without a hull is worth a warning.
 SILENT_S = 2.0
-
-#: Once per process, however many nodes are composed in it.
-warm_up = functools.cache(PoseEstimator.warm_up)
 
 
 @dataclass(frozen=True)
@@ -94,7 +90,7 @@ class PoseNode(Node):
         self.meter = Meter()
         # Before there is anything on the graph: who sees `joints` (a stepped replay) takes the node for ready.
         self.get_logger().info("loading the kernels; the first start compiles them, which may take a minute")
-        warm_up()
+        PoseEstimator.warm_up()
         self.joints = self.create_publisher(PoseArray, topics.JOINTS, topics.STREAM_QOS)
         self.angles = self.create_publisher(JointState, topics.JOINT_ANGLES, topics.STREAM_QOS)
         self.markers = self.create_publisher(MarkerArray, topics.MARKERS, topics.STREAM_QOS)

@@ -107,6 +107,7 @@ def main(
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, on_signal)
     try:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGTERM})  # see nodes/process_server.py
         made = make_nodes()
         nodes = [made] if isinstance(made, Node) else made
         spinning = True

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Starts the processes of a smart space, restarts the ones that die, and leaves none behind.
 
-It is no ROS node itself, so nothing in ROS can take it down. Every child leads a process group of its own: Ctrl-C in a
-terminal reaches only us, and we stop the children in order: interrupt, terminate, kill. A child also ends by itself
-when we are killed.
+It is no ROS node itself, so nothing in ROS can take it down. The processes are forked by a server that has imported
+what they need (`process_starter`). Every child leads a process group of its own: Ctrl-C in a terminal reaches only us,
+and we stop the children in order: interrupt, terminate, kill. A child also ends by itself when we are killed.
 """
 
 from __future__ import annotations
@@ -12,15 +12,15 @@ import json
 import os
 import signal
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import FrameType
-from typing import Any
+from typing import IO, Any
 
 from limbloc_ros.core.config import setting
+from limbloc_ros.ros.process_starter import ProcessStarter, StartedProcess
 
 POLL_S = 0.1
 #: A process that has run this long starts with the short delay again when it dies.
@@ -67,7 +67,8 @@ class _Child:
 
     def __init__(self, plan: ProcessPlan) -> None:
         self.plan = plan
-        self.process: subprocess.Popen[str] | None = None
+        self.process: StartedProcess | None = None
+        self.requested = False
         self.reader: threading.Thread | None = None
         self.started_s = 0.0
         self.restart_at_s: float | None = None
@@ -100,6 +101,8 @@ class Supervisor:
         self.restarts = {plan.name: 0 for plan in plans}
         self.failure = ""
         self._environment = {**os.environ, **environment}
+        self._starter = ProcessStarter(self._environment)
+        self._server: subprocess.Popen[str] | None = None
         self._say = say or _print
         self._children = [_Child(plan) for plan in plans]
         self._stop = threading.Event()
@@ -118,10 +121,10 @@ class Supervisor:
         return {c.plan.name: c.process.pid for c in self._children if c.process and c.process.poll() is None}
 
     def start(self) -> None:
-        """Start all processes."""
+        """Have all processes started, in their order; `poll` sees when they run."""
         try:
             for child in self._children:
-                self._spawn(child)
+                self._request(child)
         except BaseException:
             self.stop()
             raise
@@ -129,12 +132,12 @@ class Supervisor:
     def poll(self) -> bool:
         """Look after the children once: restart what died. False when the graph is over or cannot go on."""
         now = time.monotonic()
+        self._meet_started(now)
         for child in self._children:
             if child.restart_at_s is not None and now >= child.restart_at_s:
                 child.restart_at_s = None
-                self.restarts[child.plan.name] += 1
-                self._spawn(child)
-            if child.process is None or child.finished or child.restart_at_s is not None:
+                self._request(child)
+            if child.process is None or child.finished or child.requested or child.restart_at_s is not None:
                 continue
             code = child.process.poll()
             if code is not None and not self._died(child, code, now):
@@ -164,18 +167,20 @@ class Supervisor:
 
     def stop(self) -> None:
         """End all processes: interrupt, then terminate, then kill. Returns when none is left."""
+        for key, process in self._starter.close():
+            self._children[key].process = process
         patience = ((signal.SIGINT, self.config.interrupt_s), (signal.SIGTERM, self.config.terminate_s))
         for number, seconds in (*patience, (signal.SIGKILL, 10.0)):
-            alive = [child for child in self._children if _group_alive(child)]
+            alive = [(c.plan.name, c.process) for c in self._children if c.process and c.process.group_alive()]
             if not alive:
                 break
             if number != signal.SIGINT:
-                names = ", ".join(child.plan.name for child in alive)
+                names = ", ".join(name for name, _ in alive)
                 self._say(f"{names} did not end in time; sending {number.name}")
-            for child in alive:
-                _signal_group(child, number)
+            for _, process in alive:
+                process.signal_group(number)
             deadline = time.monotonic() + seconds
-            while any(_group_alive(child) for child in alive) and time.monotonic() < deadline:
+            while any(process.group_alive() for _, process in alive) and time.monotonic() < deadline:
                 if self._hurry.is_set() and number == signal.SIGINT:
                     break
                 time.sleep(0.05)
@@ -184,30 +189,52 @@ class Supervisor:
                 child.process.wait()
             if child.reader is not None:
                 child.reader.join()
-            child.restart_at_s = None
+            child.restart_at_s, child.requested = None, False
 
-    def _spawn(self, child: _Child) -> None:
-        arguments = [child.plan.description, "--parent", str(os.getpid())]
-        child.process = subprocess.Popen(
-            [sys.executable, "-m", "limbloc_ros.nodes.composed", *arguments],
-            # Names the process's keys, for graphs that run with ROS_SECURITY_ENABLE.
-            env={"ROS_SECURITY_ENCLAVE_OVERRIDE": f"{ENCLAVES}/{child.plan.name}", **self._environment},
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            errors="replace",
-            start_new_session=True,
-        )
-        child.started_s = time.monotonic()
-        child.reader = threading.Thread(target=self._forward, args=(child.process, child.plan.name), daemon=True)
-        child.reader.start()
+    def _request(self, child: _Child) -> None:
+        name = child.plan.name
+        ours, theirs = os.pipe()
+        child.reader = self._forward(os.fdopen(ours, encoding="utf-8", errors="replace"), name)
+        # Names the process's keys, for graphs that run with ROS_SECURITY_ENABLE; who has chosen some keeps them.
+        variables = {"ROS_SECURITY_ENCLAVE_OVERRIDE": f"{ENCLAVES}/{name}"}
+        own = {key: value for key, value in variables.items() if key not in self._environment}
+        try:
+            self._starter.request(self._children.index(child), name, child.plan.description, own, theirs)
+            child.requested = True
+        except OSError as error:
+            self._restart_later(child, str(error), time.monotonic())
+        finally:
+            os.close(theirs)
+        if self._starter.server is not None and self._starter.server is not self._server:
+            self._server = self._starter.server
+            assert self._server.stdout is not None
+            self._forward(self._server.stdout, "start")
 
-    def _forward(self, process: subprocess.Popen[str], name: str) -> None:
-        assert process.stdout is not None
-        with process.stdout as lines:
-            for line in lines:
-                self._say(f"[{name}] {line.rstrip()}")
+    def _meet_started(self, now: float) -> None:
+        """Take over what the server has started since the last time."""
+        try:
+            for key, process in self._starter.started():
+                child = self._children[key]
+                if child.process is not None:
+                    self.restarts[child.plan.name] += 1
+                child.process, child.started_s, child.requested = process, now, False
+        except OSError as error:
+            for child in self._children:
+                if child.requested:
+                    child.requested = False
+                    self._restart_later(child, str(error), now)
+
+    def _forward(self, lines: IO[str], name: str) -> threading.Thread:
+        """Say each line with the name in front, in a thread of its own."""
+
+        def read() -> None:
+            with lines:
+                for line in lines:
+                    self._say(f"[{name}] {line.rstrip()}")
+
+        reader = threading.Thread(target=read, daemon=True)
+        reader.start()
+        return reader
 
     def _died(self, child: _Child, code: int, now: float) -> bool:
         """A child has ended: plan its restart. False when that ends the graph."""
@@ -222,40 +249,23 @@ class Supervisor:
             self._say(f"{name} has ended")
             child.finished = True
             return True
-        _signal_group(child, signal.SIGKILL)  # whatever the dead process may have started
+        assert child.process is not None
+        child.process.signal_group(signal.SIGKILL)  # whatever the dead process may have started
         if now - child.started_s >= SETTLED_S:
             child.deaths = 0
+        self._restart_later(child, _cause(code), now)
+        return True
+
+    def _restart_later(self, child: _Child, cause: str, now: float) -> None:
         delay = min(self.config.restart_delay_s * 2.0**child.deaths, self.config.restart_max_delay_s)
         child.deaths += 1
         child.restart_at_s = now + delay
-        self._say(f"{name} died ({_cause(code)}); starting it again in {delay:g} s")
-        return True
+        self._say(f"{child.plan.name} died ({cause}); starting it again in {delay:g} s")
 
     def _on_signal(self, number: int, _: FrameType | None) -> None:
         if self._stop.is_set():
             self._hurry.set()
         self._stop.set()
-
-
-def _signal_group(child: _Child, number: signal.Signals) -> None:
-    if child.process is not None:
-        try:
-            os.killpg(child.process.pid, number)
-        except ProcessLookupError:
-            return  # it was faster
-
-
-def _group_alive(child: _Child) -> bool:
-    """Whether the process or anything in its group still runs."""
-    if child.process is None:
-        return False
-    if child.process.poll() is None:
-        return True
-    try:
-        os.killpg(child.process.pid, 0)
-    except ProcessLookupError:
-        return False
-    return True
 
 
 def _cause(code: int) -> str:
