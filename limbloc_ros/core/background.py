@@ -380,14 +380,7 @@ class BackgroundModel:
         change = np.empty(planes.shape[1:], dtype=np.uint8)
         colour = np.empty_like(change)
         measure(
-            planes,
-            self._level,
-            self._sharpness,
-            self._gain,
-            np.float32(darkest),
-            np.float32(brightest),
-            change,
-            colour,
+            planes, self._level, self._sharpness, self._gain, np.float32(darkest), np.float32(brightest), change, colour
         )
         return change, colour
 
