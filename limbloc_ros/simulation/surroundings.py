@@ -52,13 +52,15 @@ def _floor(rng: np.random.Generator) -> Image:
             image[row : row + plank, max(begin, 0) : max(begin, 0) + 1] *= 0.6
         image[row : row + 1] *= 0.6
     image *= (1 + _cloud(rng, (n, n), (0.012, 0.25), 0.05) + _cloud(rng, (n, n), (0.5, 0.5), 0.03))[..., None]
-    y, x = np.mgrid[:n, :n].astype(np.float32) * np.float32(TEXEL_M) - np.float32(HALF_M)
+    x = np.arange(n, dtype=np.float32) * np.float32(TEXEL_M) - np.float32(HALF_M)
+    y = x[:, None]
     radius = np.hypot(x, y)
-    rug = np.where((radius < 1.25)[..., None], np.array([104, 98, 110], np.float32), image)
-    rug[(np.abs(radius - 1.1) < 0.03) | (np.abs(radius - 0.55) < 0.02)] = (120, 128, 140)
+    rug = radius < 1.25
     weave = 1 + 0.035 * np.sin(x * 180) * np.sin(y * 180) + _cloud(rng, (n, n), (0.02, 0.02), 0.03)
-    image = np.where((radius < 1.25)[..., None], rug * weave[..., None], image)
-    lamp = 0.72 + 0.36 * np.exp(-((x - 0.4) ** 2 + (y + 0.3) ** 2) / 6.0)
+    ring = (np.abs(radius - 1.1) < 0.03) | (np.abs(radius - 0.55) < 0.02)
+    colours = np.where(ring[rug][:, None], np.array([120, 128, 140], np.float32), np.array([104, 98, 110], np.float32))
+    image[rug] = colours * weave[rug][:, None]
+    lamp = 0.72 + 0.36 * np.exp(-((x - 0.4) ** 2) / 6.0) * np.exp(-((y + 0.3) ** 2) / 6.0)
     return np.asarray(np.clip(image * lamp[..., None], 0, 255).astype(np.uint8))
 
 
@@ -147,32 +149,35 @@ def camera_rays(camera: Camera) -> NDArray[np.float64]:
 
 def backdrop(camera: Camera, seed: int) -> Backdrop:
     """Cast every pixel's ray onto the room's walls and floor; the camera must be inside the room."""
-    rays, centre = camera_rays(camera), camera.T_world_camera[:3, 3]
-    low, high = np.array([-HALF_M, -HALF_M, 0.0]), np.array([HALF_M, HALF_M, HEIGHT_M])
+    centre = camera.T_world_camera[:3, 3].astype(np.float32)
+    x, y, z = rays = np.moveaxis(camera_rays(camera), -1, 0).astype(np.float32)  # planes are several times as fast
+    room = np.array([[-HALF_M, HALF_M], [-HALF_M, HALF_M], [0.0, HEIGHT_M]], np.float32)
     with np.errstate(divide="ignore"):
-        reach = np.where(rays > 0, (high - centre) / rays, (low - centre) / rays)
-    axis = reach.argmin(-1)
-    hit = centre + rays * reach.min(-1)[..., None]
+        reach = [
+            np.where(ray > 0, high - at, low - at) / ray
+            for ray, at, (low, high) in zip(rays, centre, room, strict=True)
+        ]
+    to_wall = np.minimum(reach[0], reach[1])
+    on_wall, on_x = to_wall <= reach[2], reach[0] <= reach[1]
+    is_floor, is_ceiling = ~on_wall & (z <= 0), ~on_wall & (z > 0)
+    nearest = np.minimum(to_wall, reach[2])
+    hit_x, hit_y, hit_z = (at + ray * nearest for at, ray in zip(centre, rays, strict=True))
     n, h = _size(2 * HALF_M), _size(HEIGHT_M)
-    x, y, z = np.moveaxis(hit, -1, 0)
-    forward = np.take_along_axis(rays, axis[..., None], -1)[..., 0] > 0
-    is_floor, is_ceiling = (axis == 2) & ~forward, (axis == 2) & forward
-    wall = np.where(axis == 0, 0, 2) + forward
-    column = np.where(axis == 0, y, x) + HALF_M
-    row = np.where(is_floor, y + HALF_M, 0.0) / TEXEL_M
-    along_wall = np.clip((HEIGHT_M - z) / TEXEL_M, 0.5, h - 1.5)
-    row = np.where(axis < 2, n + wall * h + along_wall, row)
-    row = np.where(is_ceiling, n + 4 * h + 1.5, row)
+    wall = np.where(on_x, x > 0, 2 + (y > 0))
+    column = np.where(on_wall & on_x, hit_y, hit_x) + np.float32(HALF_M)
+    along_wall = np.clip((HEIGHT_M - hit_z) / TEXEL_M, 0.5, h - 1.5)
+    on_floor = np.clip((hit_y + np.float32(HALF_M)) / TEXEL_M - 0.5, 0, n - 1)
+    row = np.where(on_wall, n + wall * h + along_wall, np.where(is_ceiling, n + 4 * h + 1.5, on_floor))
     image = cv2.remap(
         _atlas(seed),
         np.clip(column / TEXEL_M - 0.5, 0, n - 1).astype(np.float32),
-        np.where(is_floor, np.clip(row - 0.5, 0, n - 1), row).astype(np.float32),
+        row.astype(np.float32),
         cv2.INTER_LINEAR,
     )
     # The lens: a little blur, and darker corners.
     image = cv2.GaussianBlur(image, (3, 3), 0.7).astype(np.float32)
-    v, u = np.mgrid[: camera.height, : camera.width].astype(np.float32)
-    corner = np.hypot(u - camera.width / 2, v - camera.height / 2) / np.hypot(camera.width, camera.height) * 2
-    image *= (1 - 0.14 * corner**2)[..., None]
-    floor = np.where(is_floor[..., None], hit[..., :2], np.nan).astype(np.float32)
+    v = np.arange(camera.height, dtype=np.float32)[:, None] - camera.height / 2
+    u = np.arange(camera.width, dtype=np.float32) - camera.width / 2
+    image *= 1 - 0.14 * (4 / (camera.width**2 + camera.height**2) * (u * u + v * v))[..., None]
+    floor = np.where(is_floor[..., None], np.stack([hit_x, hit_y], axis=-1), np.float32(np.nan))
     return Backdrop(np.clip(image, 0, 255).astype(np.uint8), floor)
