@@ -85,7 +85,7 @@ def _run_live(args: argparse.Namespace, out: Path) -> None:
     from limbloc_ros.rig.rig_file import save_rig
     from limbloc_ros.ros.environment import graph_environment
     from limbloc_ros.ros.supervisor import Supervisor
-    from limbloc_ros.simulation.room import default_rig
+    from limbloc_ros.simulation.ring import default_rig
 
     save_rig(default_rig(args.cameras), out / "rig.yaml")
     settings = [

@@ -11,17 +11,18 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from limbloc_ros.core.config import from_mapping, setting
 from limbloc_ros.core.errors import ConfigError
-from limbloc_ros.recordings.bag_frames import CameraStream, camera_streams
-from limbloc_ros.recordings.bags import BagReader
 from limbloc_ros.rig.plain_values import yaml_values
 from limbloc_ros.rig.rig_file import load_rig, save_rig
 from limbloc_ros.ros.environment import NetworkConfig
 from limbloc_ros.ros.supervisor import ProcessConfig, ProcessPlan
-from limbloc_ros.simulation.room import default_rig
+from limbloc_ros.simulation.ring import default_rig
+
+if TYPE_CHECKING:
+    from limbloc_ros.recordings.bag_frames import CameraStream
 
 #: Sections that hold parameters of nodes, and so names that we do not check here.
 NODE_SECTIONS = ("segmentation", "carving", "pose", "simulated_cameras", "replay", "record", "foxglove_bridge")
@@ -164,6 +165,9 @@ class _Plan:
 
     def replayed(self) -> list[ProcessPlan]:
         """A recording, and the graph behind its images or masks."""
+        from limbloc_ros.recordings.bag_frames import camera_streams  # takes half of what the rest of a start does
+        from limbloc_ros.recordings.bags import BagReader
+
         c = self.config
         if not c.bag:
             raise ConfigError("bag: expected a rosbag2 folder or file for source bag, got none")

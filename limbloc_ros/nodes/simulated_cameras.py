@@ -36,8 +36,9 @@ from limbloc_ros.ros.messages import (
 from limbloc_ros.ros.parameters import NodeParameters
 from limbloc_ros.ros.transforms import TransformOutput
 from limbloc_ros.simulation.company import MOST, TOGETHER, chair, company
+from limbloc_ros.simulation.ring import default_rig
 from limbloc_ros.simulation.room import Image as Image8
-from limbloc_ros.simulation.room import SimulatedRoom, default_rig
+from limbloc_ros.simulation.room import SimulatedRoom
 
 #: Looks a frame: whether it is time to draw the next one, or to send it.
 TICKS = 8

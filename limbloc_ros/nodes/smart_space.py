@@ -10,8 +10,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from rclpy.utilities import remove_ros_args
-
 from limbloc_ros.core.errors import ConfigError, LimblocError
 from limbloc_ros.nodes.graph_plan import SmartSpaceConfig, load_config, plan_graph
 from limbloc_ros.rig.plain_values import yaml_values
@@ -108,7 +106,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         "smart_space", description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     add_arguments(parser)
-    options = parser.parse_args(remove_ros_args(list(sys.argv if argv is None else ["smart_space", *argv]))[1:])
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    if "--ros-args" in arguments:  # as launch files give them; without them ROS need not be loaded here
+        from rclpy.utilities import remove_ros_args
+
+        arguments = remove_ros_args(arguments)
+    options = parser.parse_args(arguments)
     try:
         return run(config_from_arguments(options))
     except LimblocError as error:
