@@ -53,7 +53,7 @@ def test_without_a_command_it_shows_the_help(capsys):
         (["process", str(CASE), "--rig", "nowhere.yaml"], "rig file nowhere.yaml does not exist"),
         (["process", str(CASE), "--jobs", "-2"], "--jobs: expected 1 or more"),
         (["process", str(CASE), "--out", "x.npz", "--report"], "--report needs a folder"),
-        (["process", str(CASE), "--config", "nowhere.yaml"], "parameters file nowhere.yaml cannot be read"),
+        (["process", str(CASE), "--config", "nowhere.yaml"], "parameters file nowhere.yaml does not exist"),
         (["report", "nowhere"], "holds no finished run"),
     ],
 )
