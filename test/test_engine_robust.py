@@ -228,7 +228,7 @@ def test_refinement_lowers_the_energy_and_keeps_a_fit():
     evidence = gather_evidence(hull, extract_surface(hull), 600, np.random.default_rng(1))
     rng = np.random.default_rng(2)
     for _ in range(3):
-        step = rng.normal(0, 0.05, 3 + figure.N_DOF + len(fit.state.shape))
+        step = rng.normal(0, 0.03, 3 + figure.N_DOF + len(fit.state.shape))  # the final weights lead from near by only
         step[:3] *= 0.3
         step[3 + figure.N_DOF :] = 0.0
         start = fit.state.moved(step)
@@ -236,7 +236,7 @@ def test_refinement_lowers_the_energy_and_keeps_a_fit():
         assert result.system.cost < 0.7 * system(start, evidence, Weights()).cost
         assert result.system.cost == system(result.state, evidence, Weights()).cost
         shift = figure.place(result.state).joints - figure.place(fit.state).joints
-        assert np.median(np.linalg.norm(shift, axis=1)) < 0.03
+        assert np.median(np.linalg.norm(shift, axis=1)) < 0.01
 
 
 def test_a_known_size_is_kept_as_far_as_it_weighs():

@@ -146,8 +146,8 @@ class Stand:
         monkeypatch.setattr(tracker, "gather_evidence", lambda *args: SimpleNamespace(args=args))
         monkeypatch.setattr(Tracker, "_check_arms", self.check)
 
-    def search(self, hull, surface, seed, weights, effort, harder):
-        self.searched.append((self.frame, seed, weights, effort, harder))
+    def search(self, hull, surface, seed, weights, searches):
+        self.searched.append((self.frame, seed, weights, searches))
         if self.scratch_cost is None:
             return None
         return Fit(
@@ -192,10 +192,10 @@ def test_calm_frames_are_followed_and_arms_checked_now_and_then(stand):
 
 
 def test_what_is_searched_can_be_said(stand):
-    effort, weights = replace(Tracker.SEARCH, torsos=1), tracker.Weights(surface=2.0)
-    stand.run(Tracker(seed=5, weights=weights, effort=effort), 1)
+    searches, weights = (replace(Tracker.SEARCHES[0], torsos=1),), tracker.Weights(surface=2.0)
+    stand.run(Tracker(seed=5, weights=weights, searches=searches), 1)
     stand.run(Tracker(seed=6), 1)
-    assert stand.searched == [(1, 5, weights, effort, None), (2, 6, tracker.Weights(), Tracker.SEARCH, None)]
+    assert stand.searched == [(1, 5, weights, searches), (2, 6, tracker.Weights(), Tracker.SEARCHES)]
 
 
 def test_the_figure_is_carried_with_the_surface(stand):

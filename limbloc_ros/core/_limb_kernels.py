@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from limbloc_ros.core._figure_kernels import part_bounds, part_distance
 from limbloc_ros.core._search_kernels import depth_at, spread_out
+from limbloc_ros.core._surface_fit_kernels import distance_to_part, lay_out
 
 #: Ragged masks eat into limbs: a bone may be thinner than expected by this fraction of its radius at no cost.
 EATEN = 0.4
@@ -62,8 +62,8 @@ def explained_grid(sdf: Any, origin: Any, voxel: float, stride: int, parts: Any,
     ny = (sdf.shape[1] + stride - 1) // stride
     nz = (sdf.shape[2] + stride - 1) // stride
     out = np.zeros((nx, ny, nz), np.float32)
-    bounds = part_bounds(parts, spheres, radii)
-    w = np.empty(3)
+    rows, bounds = lay_out(parts, spheres, radii)
+    no_ray = np.zeros(3)
     for i in range(nx):
         x = origin[0] + i * stride * voxel
         for j in range(ny):
@@ -74,15 +74,16 @@ def explained_grid(sdf: Any, origin: Any, voxel: float, stride: int, parts: Any,
                 z = origin[2] + k * stride * voxel
                 worst = 0.0
                 for p in range(len(parts)):
-                    bx = x - bounds[p, 0]
-                    by = y - bounds[p, 1]
-                    bz = z - bounds[p, 2]
-                    reach = bounds[p, 3] + worst
+                    bx = x - bounds[0, p]
+                    by = y - bounds[1, p]
+                    bz = z - bounds[2, p]
+                    reach = bounds[3, p] + worst
                     if reach <= 0.0 or bx * bx + by * by + bz * bz > reach * reach:
                         continue
+                    d, _, _ = distance_to_part(rows[p], x, y, z, no_ray)
+                    worst = min(worst, d)
                     if worst < -0.05:
                         break
-                    worst = min(worst, part_distance(x, y, z, parts[p], spheres, radii, w))
                 out[i, j, k] = min(-worst / 0.05, 1.0)
     return out
 

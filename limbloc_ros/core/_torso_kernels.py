@@ -13,6 +13,19 @@ from limbloc_ros.core._figure_kernels import exp_so3, forward, log_so3
 from limbloc_ros.core._search_kernels import depth_at
 
 
+@njit(cache=True, inline="always", error_model="numpy")  # type: ignore[misc, unused-ignore]
+def misfit(phi: float, radius: float, solid: bool, clip: float) -> float:
+    """Clipped square of how badly a sphere matches at whose centre the signed distance is phi; see `torso_score`."""
+    if solid:
+        e = phi + radius
+        if e > 0.0:
+            e *= 1.5
+    else:
+        e = max(0.0, radius - phi)
+    e = min(max(e, -clip), clip)
+    return e * e
+
+
 @njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def torso_score(
     sdf: Any, origin: Any, voxel: float, points: Any, radii: Any, weights: Any, n_solid: int, clip: float
@@ -23,20 +36,10 @@ def torso_score(
     below its radius outside. Mean of clipped squares over clip^2, so 0 is perfect and 1 a complete miss.
     """
     total = 0.0
-    norm = 0.0
     for n in range(len(points)):
-        e = depth_at(sdf, origin, voxel, points[n, 0], points[n, 1], points[n, 2])
-        w = weights[n]
-        if n < n_solid:
-            e += radii[n]
-            if e > 0.0:
-                e *= 1.5
-        else:
-            e = max(0.0, radii[n] - e)
-        e = min(max(e, -clip), clip)
-        total += w * e * e
-        norm += w
-    return total / (norm * clip * clip)
+        phi = depth_at(sdf, origin, voxel, points[n, 0], points[n, 1], points[n, 2])
+        total += weights[n] * misfit(phi, radii[n], n < n_solid, clip)
+    return total / (weights.sum() * clip * clip)  # type: ignore[no-any-return]
 
 
 @njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
@@ -93,8 +96,19 @@ def torso_from_pairs(
     parents, bone_offsets, point_bones, point_offsets, point_radii = table
     out = np.empty((most, 14))
     count = 0
+    worst = 0
     pose = np.zeros(13)
     R = np.empty((3, 3))
+    turn = np.empty(3)
+    # the unit figure of each bend; every torso is one of these, turned and scaled
+    unit_points = np.empty((len(bends), len(point_bones), 3))
+    unit_radii = np.empty(len(point_bones))
+    for c in range(len(bends)):
+        pose[6:9] = bends[c]
+        unit_points[c], unit_radii[:] = place_torso(
+            pose, parents, bone_offsets, point_bones, point_offsets, point_radii
+        )
+    norm = weights.sum()
     for a in range(len(pelvis_seeds)):
         for b in range(len(head_seeds)):
             dx = head_seeds[b, 0] - pelvis_seeds[a, 0]
@@ -111,6 +125,7 @@ def torso_from_pairs(
                 outside |= depth_at(sdf, origin, voxel, x, y, z) > 0.03
             if outside:
                 continue
+            vx, vy, vz = dx / length, dy / length, dz / length
             for c in range(len(bends)):
                 ax = axis_tip[c, 0] - axis_base[c, 0]
                 ay = axis_tip[c, 1] - axis_base[c, 1]
@@ -121,21 +136,19 @@ def torso_from_pairs(
                     continue
                 # rotation that takes the figure's axis to the pair's direction, then yaw about the latter
                 ux, uy, uz = ax / unit, ay / unit, az / unit
-                vx, vy, vz = dx / length, dy / length, dz / length
                 kx, ky, kz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
                 sine = math.sqrt(kx * kx + ky * ky + kz * kz)
                 cosine = ux * vx + uy * vy + uz * vz
-                w = np.zeros(3)
+                turn[:] = 0.0
                 angle = math.atan2(sine, cosine)
                 if sine > 1e-6:
-                    w[0] = kx / sine * angle
-                    w[1] = ky / sine * angle
-                    w[2] = kz / sine * angle
+                    turn[0] = kx / sine * angle
+                    turn[1] = ky / sine * angle
+                    turn[2] = kz / sine * angle
                 elif cosine < 0.0:
-                    w[0] = math.pi
-                align = exp_so3(w)
+                    turn[0] = math.pi
+                align = exp_so3(turn)
                 for y in range(yaws):
-                    turn = np.empty(3)
                     phi = math.pi * y / yaws
                     turn[0] = vx * phi
                     turn[1] = vy * phi
@@ -144,28 +157,40 @@ def torso_from_pairs(
                     for i in range(3):
                         for j in range(3):
                             R[i, j] = T[i, 0] * align[0, j] + T[i, 1] * align[1, j] + T[i, 2] * align[2, j]
-                    pose[3:6] = log_so3(R)
                     for i in range(3):
                         pose[i] = pelvis_seeds[a, i] - stature * (
                             R[i, 0] * axis_base[c, 0] + R[i, 1] * axis_base[c, 1] + R[i, 2] * axis_base[c, 2]
                         )
-                        pose[6 + i] = bends[c, i]
-                        pose[9 + i] = 0.0
-                    pose[12] = math.log(stature)
-                    points, radii = place_torso(pose, parents, bone_offsets, point_bones, point_offsets, point_radii)
-                    score = torso_score(sdf, origin, voxel, points, radii, weights, n_solid, 0.04 * stature)
+                    clip = 0.04 * stature
+                    enough = out[worst, 13] * norm * clip * clip if count == most else math.inf
+                    total = 0.0
+                    for n in range(len(weights)):
+                        px, py, pz = unit_points[c, n]
+                        e = depth_at(
+                            sdf,
+                            origin,
+                            voxel,
+                            pose[0] + stature * (R[0, 0] * px + R[0, 1] * py + R[0, 2] * pz),
+                            pose[1] + stature * (R[1, 0] * px + R[1, 1] * py + R[1, 2] * pz),
+                            pose[2] + stature * (R[2, 0] * px + R[2, 1] * py + R[2, 2] * pz),
+                        )
+                        total += weights[n] * misfit(e, stature * unit_radii[n], n < n_solid, clip)
+                        if total >= enough:
+                            break
+                    if total >= enough:
+                        continue
+                    row = worst
                     if count < most:
-                        out[count, :13] = pose
-                        out[count, 13] = score
+                        row = count
                         count += 1
-                    else:
-                        worst = 0
-                        for m in range(1, most):
-                            if out[m, 13] > out[worst, 13]:
-                                worst = m
-                        if score < out[worst, 13]:
-                            out[worst, :13] = pose
-                            out[worst, 13] = score
+                    out[row, :3] = pose[:3]
+                    out[row, 3:6] = log_so3(R)
+                    out[row, 6:9] = bends[c]
+                    out[row, 9:12] = 0.0
+                    out[row, 12] = math.log(stature)
+                    out[row, 13] = total / (norm * clip * clip)
+                    if count == most:
+                        worst = int(out[:, 13].argmax())
     return out[:count]
 
 

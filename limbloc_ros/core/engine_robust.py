@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -36,9 +37,13 @@ class Effort:
         single_arms, single_legs, rounds: other places that are tried for each limb of the winner, and how many rounds
             of that at most.
         finalists: so many are refined on all points; the one of lowest energy is the result.
+        candidates: places that are weighed for each limb.
         quick_points, points: surface points until then, and then.
         iterations: most steps of the refinements: first, survivors, repairs, under strict limits, final.
         lenient_limits: weight of joint limits at first.
+        enough: an energy (m^2) below which the figure is believed and nothing more is searched.
+        certain: an energy below which the winner's limbs are not tried elsewhere.
+        dressed: whether figures may wear loose clothes while they are searched; they begin with those of the last fit.
     """
 
     torsos: int = 4
@@ -53,10 +58,14 @@ class Effort:
     single_legs: int = 2
     rounds: int = 2
     finalists: int = 2
+    candidates: int = 80
     quick_points: int = 350
     points: int = 1000
     iterations: tuple[int, int, int, int, int] = (3, 5, 6, 4, 12)
     lenient_limits: float = 3e-3
+    enough: float = 5e-4
+    certain: float = 0.0
+    dressed: bool = False
 
 
 #: While the figure is searched, residuals are believed from further off, it is held in the hull more firmly, and nobody
@@ -64,14 +73,16 @@ class Effort:
 SEARCH_WEIGHTS = {"inclusion": 0.006, "surface_width_m": 0.06, "clothing": 1e-2}
 #: Weight of clothing when figures are judged, and when it is searched again.
 JUDGED_CLOTHING = 2e-5
-#: Tried when the energy (m^2) stays above DOUBTFUL_COST.
-HARDER = Effort(torsos=14, leg_pairs=4, starts=24, survivors=8, repaired=3)
-DOUBTFUL_COST = 5e-4
+#: One search after the other, until the energy is low: most figures are found easily, and of 170 frames whose first
+#: search ended below 2e-4 no harder one was right where that was wrong.
+QUICK = Effort(
+    torsos=2, leg_pairs=2, starts=4, survivors=2, arm_repairs=2, strict=2, single_arms=2, single_legs=1, rounds=1,
+    finalists=1, candidates=40, enough=2e-4, certain=1.6e-4,
+)  # fmt: skip
+HARDER = Effort(torsos=14, leg_pairs=4, starts=24, survivors=8, repaired=3, enough=0.0, dressed=True)
+SEARCHES = (QUICK, Effort(), HARDER)
 #: Figures of up to so many times the least energy are rivals.
 RIVAL_COST = 1.5
-
-#: Candidates for one limb.
-CANDIDATES = 80
 
 ARM_BONES = np.array([figure.BONE[f"{name}_{side}"] for side in "LR" for name in ARM.bones])
 _LIMB_BASES = ("upper_arm", "forearm", "hand")
@@ -176,14 +187,14 @@ class Scene:
     weights: Weights
 
 
-def with_legs(state: FigureState, scene: Scene, pairs: int) -> list[FigureState]:
+def with_legs(state: FigureState, scene: Scene, pairs: int, candidates: int) -> list[FigureState]:
     """The figure with each of the best pairs of legs."""
-    return _with_pairs(state, scene, LEG, search.TRUNK_PARTS, search.UPPER_TRUNK_PARTS, pairs)
+    return _with_pairs(state, scene, LEG, search.TRUNK_PARTS, search.UPPER_TRUNK_PARTS, pairs, candidates)
 
 
-def with_arms(state: FigureState, scene: Scene, pairs: int) -> list[FigureState]:
+def with_arms(state: FigureState, scene: Scene, pairs: int, candidates: int) -> list[FigureState]:
     """The figure, which has legs, with each of the best pairs of arms."""
-    return _with_pairs(state, scene, ARM, BODY_PARTS, BODY_PARTS, pairs)
+    return _with_pairs(state, scene, ARM, BODY_PARTS, BODY_PARTS, pairs, candidates)
 
 
 def _with_pairs(
@@ -193,11 +204,12 @@ def _with_pairs(
     body: NDArray[np.int64],
     solid: NDArray[np.int64],
     pairs: int,
+    candidates: int,
 ) -> list[FigureState]:
     placed = figure.place(state)
     hull = scene.hull
     taken = search.explained_volume(hull, placed, solid)
-    left, right = (search.limb_candidates(hull, scene.medial, placed, kind, side, taken, CANDIDATES) for side in "LR")
+    left, right = (search.limb_candidates(hull, scene.medial, placed, kind, side, taken, candidates) for side in "LR")
     out = []
     for a, b, _ in limb_pairs(placed, left, right, kind, body, scene.quick, scene.lenient, pairs):
         limbed = with_limb(state, placed, kind, "L", left.found[a])
@@ -205,25 +217,30 @@ def _with_pairs(
     return out or [state]
 
 
-def with_one_limb(state: FigureState, scene: Scene, kind: search.LimbKind, side: str, keep: int) -> list[FigureState]:
+def with_one_limb(
+    state: FigureState, scene: Scene, kind: search.LimbKind, side: str, keep: int, candidates: int
+) -> list[FigureState]:
     """The figure with each of the best places for one limb, all others where they are."""
     placed = figure.place(state)
     names = {f"{bone}_{side}" for bone in kind.bones}
     body = np.array([p for p, name in enumerate(figure.PART_NAMES) if name not in names])
     solid = body if kind is ARM else search.UPPER_TRUNK_PARTS
     taken = search.explained_volume(scene.hull, placed, solid)
-    limbs = search.limb_candidates(scene.hull, scene.medial, placed, kind, side, taken, CANDIDATES)
+    limbs = search.limb_candidates(scene.hull, scene.medial, placed, kind, side, taken, candidates)
     rows = best_limbs(placed, limbs, kind, side, body, scene.quick, scene.lenient, keep)
     return [with_limb(state, placed, kind, side, limbs.found[row]) for row in rows]
 
 
-def make_scene(hull: Hull, surface: Surface, seed: int, weights: Weights, effort: Effort) -> Scene:
+def make_scene(hull: Hull, medial: Medial, surface: Surface, seed: int, weights: Weights, effort: Effort) -> Scene:
     """What the search reads of a hull."""
     rng = np.random.default_rng(seed)
     quick = gather_evidence(hull, surface, effort.quick_points, rng, themselves_every=2)
     full = gather_evidence(hull, surface, effort.points, rng)
     strict = replace(weights, **SEARCH_WEIGHTS)
-    return Scene(hull, Medial.of(hull), quick, full, replace(strict, limits=effort.lenient_limits), strict, weights)
+    lenient = replace(strict, limits=effort.lenient_limits)
+    if effort.dressed:
+        strict, lenient = _dressed(strict), _dressed(lenient)
+    return Scene(hull, medial, quick, full, lenient, strict, weights)
 
 
 def fit_from_scratch(
@@ -231,8 +248,7 @@ def fit_from_scratch(
     surface: Surface,
     seed: int,
     weights: Weights | None = None,
-    effort: Effort | None = None,
-    harder: Effort | None = HARDER,
+    searches: Sequence[Effort] = SEARCHES,
 ) -> Fit | None:
     """Fit one frame alone: torso hypotheses, both facings, limbs, refinement, limb repair.
 
@@ -240,31 +256,34 @@ def fit_from_scratch(
         hull, surface: the frame.
         seed: of the random sample of surface points and of the torso search.
         weights: of the energy's terms.
-        effort: how much is searched at first.
-        harder: how much is searched again when the energy stays high; None: nothing.
+        searches: one is made after the other until one ends with an energy that is low enough for it.
 
     Returns:
         the fit of lowest energy, or None when no torso fits into the hull.
     """
-    effort = effort or Effort()
-    scene = make_scene(hull, surface, seed, weights or Weights(), effort)
+    medial = Medial.of(hull)
+    most = max(effort.torsos for effort in searches)
     torsos = [
         facing
-        for torso, _ in search.torso_hypotheses(hull, scene.medial, np.random.default_rng(seed), HARDER.torsos)
+        for torso, _ in search.torso_hypotheses(hull, medial, np.random.default_rng(seed), most)
         for facing in (torso, search.turned_about(torso))
     ]
     if not torsos:
         return None
-    winner, rivals = _fit_from_torsos(torsos[: 2 * effort.torsos], scene, effort)
-    judged = _judged(winner, scene)
-    if harder is not None and judged > DOUBTFUL_COST:
-        dressed = replace(scene, lenient=_dressed(scene.lenient), strict=firm(scene.weights))
-        clothes = winner.state.shape[figure.proportions().clothing_from :]
-        torsos = [_wearing(torso, clothes) for torso in torsos[: 2 * harder.torsos]]
-        again, others = _fit_from_torsos(torsos, dressed, harder)
-        if (cost := _judged(again, scene)) < judged:
-            winner, rivals, judged = again, others, cost
-    return Fit(winner.state, winner.system, rivals, judged)
+    best: Fit | None = None
+    for effort in searches:
+        scene = make_scene(hull, medial, surface, seed, weights or Weights(), effort)
+        some = torsos[: 2 * effort.torsos]
+        if best is not None and effort.dressed:
+            clothes = best.state.shape[figure.proportions().clothing_from :]
+            some = [_wearing(torso, clothes) for torso in some]
+        found, rivals = _fit_from_torsos(some, scene, effort)
+        judged = _judged(found, scene)
+        if best is None or judged < best.judged:
+            best = Fit(found.state, found.system, rivals, judged)
+        if best.judged < effort.enough:
+            break
+    return best
 
 
 def _judged(fit: Refined, scene: Scene) -> float:
@@ -289,13 +308,13 @@ def _wearing(state: FigureState, clothes: Array) -> FigureState:
 def _fit_from_torsos(torsos: list[FigureState], scene: Scene, effort: Effort) -> tuple[Refined, Rivals]:
     first, second, repair, strict, final = effort.iterations
     quick, lenient = scene.quick, scene.lenient
-    starts = _with_limbs(torsos, scene, effort.leg_pairs)
+    starts = _with_limbs(torsos, scene, effort)
     tried = [refine(state, quick, lenient, first) for state in _cheapest(starts, scene, effort.starts)]
     tried = [refine(r.state, quick, lenient, second) for r in _best(tried, effort.survivors)]
     # With the trunk in place and sizes adapted, limbs are looked for once more.
     for candidate in _best(tried, effort.repaired):
-        others = with_arms(candidate.state, scene, effort.arm_repairs)
-        others += _cheapest(_with_limbs([candidate.state], scene, effort.leg_pairs), scene, effort.leg_repairs)
+        others = with_arms(candidate.state, scene, effort.arm_repairs, effort.candidates)
+        others += _cheapest(_with_limbs([candidate.state], scene, effort), scene, effort.leg_repairs)
         tried += [refine(state, quick, lenient, repair) for state in others]
     least = _best(tried, 1)[0].system.cost
     rivals = tuple((r.state, r.system.cost / least) for r in tried if r.system.cost < RIVAL_COST * least)
@@ -303,6 +322,8 @@ def _fit_from_torsos(torsos: list[FigureState], scene: Scene, effort: Effort) ->
     finals = [refine(r.state, scene.full, scene.strict, final) for r in _best(tried, effort.finalists)]
     winner = _best(finals, 1)[0]
     winner = refine(winner.state, scene.full, scene.weights, final)
+    if effort.certain > 0.0 and _judged(winner, scene) < effort.certain:
+        return winner, rivals
     for _ in range(effort.rounds):
         before = winner.system.cost
         for kind, places in ((ARM, effort.single_arms), (LEG, effort.single_legs)):
@@ -318,7 +339,7 @@ def _with_better_limb(
 ) -> Refined:
     """The winner, or it with one limb elsewhere if that explains the hull better: trunk and sizes are known by now."""
     _, _, repair, strict, final = effort.iterations
-    for state in with_one_limb(winner.state, scene, kind, side, places):
+    for state in with_one_limb(winner.state, scene, kind, side, places, effort.candidates):
         settled = refine(state, scene.quick, scene.lenient, repair).state
         other = refine(settled, scene.full, scene.weights, strict)
         if other.system.cost < winner.system.cost:
@@ -326,12 +347,12 @@ def _with_better_limb(
     return winner
 
 
-def _with_limbs(states: list[FigureState], scene: Scene, leg_pairs: int) -> list[FigureState]:
+def _with_limbs(states: list[FigureState], scene: Scene, effort: Effort) -> list[FigureState]:
     """Each state with several pairs of legs, and with the arms that go with the best of them."""
     out = []
     for state in states:
-        standing = with_legs(state, scene, leg_pairs)
-        armed = with_arms(standing[0], scene, 1)[0]
+        standing = with_legs(state, scene, effort.leg_pairs, effort.candidates)
+        armed = with_arms(standing[0], scene, 1, effort.candidates)[0]
         for legged in standing:
             rotations = legged.rotations.copy()
             rotations[ARM_BONES] = armed.rotations[ARM_BONES]

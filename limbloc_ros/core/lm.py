@@ -74,8 +74,9 @@ def minimise(
     count = 0
     while count < iterations:
         count += 1
-        diagonal = np.diag(system.matrix)
-        damped = system.matrix + np.diag(damping * np.maximum(diagonal, 1e-6 * diagonal.max() + 1e-12))
+        diagonal = system.matrix.diagonal()
+        damped = system.matrix.copy()
+        damped.flat[:: len(damped) + 1] += damping * np.maximum(diagonal, 1e-6 * diagonal.max() + 1e-12)
         step = np.asarray(-np.linalg.solve(damped, system.gradient), np.float64)
         if largest_step is not None:
             step /= max(1.0, float((np.abs(step) / largest_step).max()))

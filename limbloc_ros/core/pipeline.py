@@ -107,7 +107,7 @@ class PoseEstimator:
         assert isinstance(hull, Hull)
         # The first frame is searched from scratch, with the kernels of every frame alone; the second follows.
         estimator = PoseEstimator(FitConfig(temporal=True))
-        estimator._tracker = Tracker(0, effort=_LEAST_EFFORT)
+        estimator._tracker = Tracker(0, searches=(_LEAST_EFFORT,))
         estimator.estimate(hull)
         estimator.estimate(hull)
 

@@ -3,12 +3,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
 from limbloc_ros.core import lm
 from limbloc_ros.core.energy import Evidence, Weights
 from limbloc_ros.core.engine_robust import (
+    QUICK,
     Effort,
     Fit,
     KnownSize,
@@ -21,6 +24,7 @@ from limbloc_ros.core.engine_robust import (
 )
 from limbloc_ros.core.figure import FigureState
 from limbloc_ros.core.hull import Hull
+from limbloc_ros.core.search import Medial
 from limbloc_ros.core.surface import Surface
 
 Array = NDArray[np.float64]
@@ -36,9 +40,13 @@ class Tracker:
     #: nothing better, the wait doubles, up to this: some hulls are just bad.
     PATIENCE, LONGEST_WAIT = 8, 32
     #: What is searched when starting anew: less than for a frame alone, for the next frames can mend it.
-    SEARCH = Effort(
-        leg_pairs=2, starts=6, survivors=3, arm_repairs=2, strict=2, finalists=1, single_arms=2, single_legs=0, rounds=1
-    )
+    SEARCHES = (
+        QUICK,
+        Effort(
+            leg_pairs=2, starts=6, survivors=3, arm_repairs=2, strict=2, finalists=1, single_arms=2, single_legs=0,
+            rounds=1,
+        ),
+    )  # fmt: skip
     #: Other pairs of arms that are tried when arms are checked.
     ARM_PAIRS = 2
     #: The figure is carried along with the firm weights of the search, which lead from further off; so many more steps
@@ -50,8 +58,8 @@ class Tracker:
     #: Surface points that a figure is carried along on.
     POINTS = 450
 
-    def __init__(self, seed: int, weights: Weights | None = None, effort: Effort | None = None) -> None:
-        self._seed, self._weights, self._effort = seed, weights or Weights(), effort or self.SEARCH
+    def __init__(self, seed: int, weights: Weights | None = None, searches: Sequence[Effort] = SEARCHES) -> None:
+        self._seed, self._weights, self._searches = seed, weights or Weights(), searches
         self._firm = firm(self._weights)
         self.reset()
 
@@ -83,7 +91,7 @@ class Tracker:
             fit = Fit(final.state, final.system, judged=result.system.cost)
         if fit is None or self._doubts(fit.judged):
             self._last_scratch = self._frame
-            scratch = fit_from_scratch(hull, surface, self._seed, self._weights, self._effort, None)
+            scratch = fit_from_scratch(hull, surface, self._seed, self._weights, self._searches)
             if scratch is not None and (fit is None or scratch.judged < 0.95 * fit.judged):
                 fit, self._wait = scratch, self.PATIENCE
                 self._size, self._sized = scratch.state.shape, 1
@@ -111,9 +119,9 @@ class Tracker:
         self, result: lm.LmResult[FigureState], hull: Hull, surface: Surface, evidence: Evidence
     ) -> lm.LmResult[FigureState]:
         """An arm that has slipped into the trunk stays there, for its flesh is explained: look for it elsewhere."""
-        scene = make_scene(hull, surface, self._seed, self._weights, self._effort)
+        scene = make_scene(hull, Medial.of(hull), surface, self._seed, self._weights, QUICK)
         best = result
-        for state in with_arms(result.state, scene, self.ARM_PAIRS):
+        for state in with_arms(result.state, scene, self.ARM_PAIRS, QUICK.candidates):
             settled = refine(state, scene.quick, scene.lenient, 5).state
             other = refine(settled, evidence, self._firm, 8)
             if other.system.cost < 0.94 * best.system.cost:
