@@ -31,6 +31,7 @@ CORE_ORDER = (
     "camera",
     "lens",
     "pose",
+    "mask_png",
     "images",
     "synchroniser",
     "mask_cleaning",

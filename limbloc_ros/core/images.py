@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from limbloc_ros.core.camera import MAX_PIXELS
 from limbloc_ros.core.errors import InputError
+from limbloc_ros.core.mask_png import decode_mask
 
 Pixels = NDArray[np.uint8]
 
@@ -164,6 +165,9 @@ def compressed_to_pixels(msg: CompressedPicture) -> Pixels:
     """
     data = msg.data if isinstance(msg.data, bytes) else msg.data.tobytes()
     kind = _check_compressed(data, msg.format)
+    mask = decode_mask(data)
+    if mask is not None:
+        return mask
     try:
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:

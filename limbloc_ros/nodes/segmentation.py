@@ -151,7 +151,9 @@ class SegmentationNode(Node):
 
     def watch_for_freeze(self, pixels: Pixels, stamp: int) -> None:
         """Count for how long (by stamps, ns) the camera has sent the same picture."""
-        if self.last_pixels is None or not np.array_equal(pixels, self.last_pixels):
+        last = self.last_pixels
+        # Of a picture that is new, as almost all are, a few rows tell.
+        if last is None or not (np.array_equal(pixels[::60], last[::60]) and np.array_equal(pixels, last)):
             self.same_since_ns = stamp
         self.last_pixels = pixels
         self.frozen_s = (stamp - self.same_since_ns) / NANOSECONDS
