@@ -14,13 +14,13 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseArray
 from rclpy.context import Context
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import ExternalShutdownException
 
-from limbloc_ros.core.pose import JOINT, Array
-from limbloc_ros.recordings.results import replace_file
-from limbloc_ros.report.run import LIMB_JOINTS
+from limbloc_ros.core.files import write_text
+from limbloc_ros.core.pose import JOINT, LIMB_JOINTS, Array
 from limbloc_ros.ros import topics
 from limbloc_ros.ros.messages import message_to_joints, stamp_ns, status_values
+from limbloc_ros.ros.node_main import make_executor
 
 PERIOD_S = 2.0
 COLUMNS = ("time s", "poses/s", "latency ms", "energy", "error mm", "worst mm", "")
@@ -54,7 +54,7 @@ class LiveTable:
         node.create_subscription(PoseArray, topics.JOINTS, self._on_joints, topics.STREAM_QOS)
         node.create_subscription(PoseArray, topics.TRUE_JOINTS, self._on_truth, topics.STREAM_QOS)
         node.create_subscription(DiagnosticArray, topics.DIAGNOSTICS, self._on_diagnostics, topics.DIAGNOSTICS_QOS)
-        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor = make_executor(self._context)
         self._executor.add_node(node)
         self._node = node
         return self
@@ -140,7 +140,7 @@ class LiveTable:
         writer.writerow(["stamp_s", "latency_ms", "median_error_mm", "worst_error_mm"])
         for stamp, *values in self.rows:
             writer.writerow([f"{stamp // 10**9}.{stamp % 10**9:09d}", *(f"{value:.3f}" for value in values)])
-        replace_file(path, lambda file: file.write(text.getvalue().encode()))
+        write_text(path, text.getvalue())
 
 
 def _middle(values: Array) -> str:

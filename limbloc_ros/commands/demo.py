@@ -11,7 +11,7 @@ from datetime import datetime
 from pathlib import Path
 
 from limbloc_ros.core.errors import InputError
-from limbloc_ros.recordings import offline
+from limbloc_ros.ros.process_starter import SERVER
 
 DESCRIPTION = """\
 See it work without cameras. A simulated person moves in a room that 8 simulated cameras see, with texture, noise,
@@ -32,8 +32,9 @@ examples:
   limbloc demo --domain 42        and beside it: ROS_DOMAIN_ID=42 rviz2 -d config/limbloc.rviz
 """
 
-#: Without a pose after this long something is wrong, s. The background is learned first.
-START_S = 120.0
+#: Without a pose after this long something is wrong, s. The first start of all compiles the kernels, and then the
+#: background is learned.
+START_S = 300.0
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -66,7 +67,6 @@ def run(args: argparse.Namespace) -> int:
     if (out / "bag").exists():
         raise InputError(f"{out} holds a demo already; choose another --out or remove it")
     out.mkdir(parents=True, exist_ok=True)
-    offline.prepare(print)
     _run_live(args, out)
     if args.no_report:
         return 0
@@ -115,16 +115,22 @@ def _run_live(args: argparse.Namespace, out: Path) -> None:
     # This process takes part in the same DDS domain; the variables are read when the first node is made.
     os.environ.update(environment)
 
-    from limbloc_ros.commands._live_table import LiveTable
-
     domain = os.environ["ROS_DOMAIN_ID"]
     print(f"{args.cameras} cameras at {args.rate:g} Hz, {len(plans)} processes, ROS_DOMAIN_ID {domain}")
     print("the room is empty at first, while the background is learned; Ctrl-C ends the demo early\n", flush=True)
     log = (out / "graph.log").open("w", encoding="utf-8")
-    with log, run_folder, LiveTable() as table:
-        # The supervisor ends all children on the way out, whatever happens.
-        with Supervisor(plans, environment, config.processes, lambda line: print(line, file=log, flush=True)) as graph:
-            started = time.monotonic()
+
+    def say(line: str) -> None:
+        print(line, file=log, flush=True)
+        if line.startswith(f"[{SERVER}]"):  # the first start of all takes long, and it says why
+            print(line)
+
+    # The supervisor ends all children on the way out, whatever happens.
+    with log, run_folder, Supervisor(plans, environment, config.processes, say) as graph:
+        started = time.monotonic()
+        from limbloc_ros.commands._live_table import LiveTable  # ROS is loaded while the graph starts
+
+        with LiveTable() as table:
             try:
                 while table.seconds < args.seconds:
                     if not graph.poll():

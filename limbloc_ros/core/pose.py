@@ -25,6 +25,12 @@ JOINT_NAMES: tuple[str, ...] = (
 #: Index of a joint by its name.
 JOINT = {name: index for index, name in enumerate(JOINT_NAMES)}
 
+#: The joints that the benchmark scores: the head and the limbs.
+LIMB_JOINTS = (
+    "head_centre",
+    *(f"{joint}_{side}" for joint in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle") for side in "LR"),
+)
+
 #: The stick figure: the bones as pairs of joints.
 STICK_BONES: tuple[tuple[str, str], ...] = (
     ("pelvis_centre", "torso_centre"),

@@ -18,8 +18,8 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 from numpy.typing import NDArray
 
 from limbloc_ros.core.joint_angles import NATIVE_ANGLES
-from limbloc_ros.core.pose import JOINT, Array
-from limbloc_ros.report.run import JUMP_M, JUMP_RAD, LIMB_JOINTS, RunData, jumps
+from limbloc_ros.core.pose import JOINT, LIMB_JOINTS, Array
+from limbloc_ros.report.run import JUMP_M, JUMP_RAD, RunData, jumps
 
 #: Okabe and Ito's colours, which colour-blind people can tell apart; blue and orange are also left and right.
 BLUE, ORANGE, GREEN, GREY, INK = "#0072B2", "#D55E00", "#009E73", "#8A929C", "#303640"

@@ -11,7 +11,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from limbloc_ros.core.pose import JOINT, Array
+from limbloc_ros.core.pose import JOINT, LIMB_JOINTS, Array
 from limbloc_ros.export.stick_drawing import side_of
 from limbloc_ros.report.compare import agreement
 from limbloc_ros.report.plots import (
@@ -30,7 +30,7 @@ from limbloc_ros.report.plots import (
     trace,
     words,
 )
-from limbloc_ros.report.run import LIMB_JOINTS, RunData
+from limbloc_ros.report.run import RunData
 
 CLAIM_MM = 50.0
 

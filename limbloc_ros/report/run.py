@@ -16,12 +16,6 @@ from limbloc_ros.core.errors import InputError
 from limbloc_ros.core.pose import JOINT, JOINT_NAMES, STICK_BONES, Array
 from limbloc_ros.recordings.results import Run, person_id
 
-#: The joints that the benchmark scores: the head and the limbs.
-LIMB_JOINTS = (
-    "head_centre",
-    *(f"{joint}_{side}" for joint in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle") for side in "LR"),
-)
-
 #: A step between consecutive frames is a jump when it is this many times the joint's usual one and at least so long.
 JUMP_RATIO, JUMP_M, JUMP_RAD = 5.0, 0.15, np.radians(40.0)
 #: A head that usually moves so far between frames belongs to unrelated poses, not to a movement, m.

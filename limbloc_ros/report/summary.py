@@ -7,9 +7,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from limbloc_ros.core.pose import JOINT, Array
+from limbloc_ros.core.pose import JOINT, LIMB_JOINTS, Array
 from limbloc_ros.report.compare import agreement
-from limbloc_ros.report.run import LIMB_JOINTS, RunData, joint_jumps, steps
+from limbloc_ros.report.run import RunData, joint_jumps, steps
 
 Rows = list[tuple[str, str]]
 

@@ -20,6 +20,9 @@ import subprocess
 import sys
 from collections.abc import Mapping
 
+#: What the server is called before its output.
+SERVER = "start"
+
 _PR_SET_CHILD_SUBREAPER = 36
 
 #: Longest request and answer, bytes; the description of a hundred cameras is far shorter.

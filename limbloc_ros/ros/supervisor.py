@@ -20,7 +20,7 @@ from types import FrameType
 from typing import IO, Any
 
 from limbloc_ros.core.config import setting
-from limbloc_ros.ros.process_starter import ProcessStarter, StartedProcess
+from limbloc_ros.ros.process_starter import SERVER, ProcessStarter, StartedProcess
 
 POLL_S = 0.1
 #: A process that has run this long starts with the short delay again when it dies.
@@ -208,7 +208,7 @@ class Supervisor:
         if self._starter.server is not None and self._starter.server is not self._server:
             self._server = self._starter.server
             assert self._server.stdout is not None
-            self._forward(self._server.stdout, "start")
+            self._forward(self._server.stdout, SERVER)
 
     def _meet_started(self, now: float) -> None:
         """Take over what the server has started since the last time."""
