@@ -16,7 +16,7 @@ from limbloc_ros.core.camera import Camera, Rig
 from limbloc_ros.core.config import HullConfig
 from limbloc_ros.core.errors import InputError, NoPerson, RigError
 from limbloc_ros.core.hull import NOBODY, Hull, carve, evaluate, evaluate_again, largest_component
-from limbloc_ros.core.silhouettes import cleaned, measure_silhouettes, min_seen, pack_cameras
+from limbloc_ros.core.silhouettes import cleaned, lattice_bounds, measure_silhouettes, min_seen, pack_cameras
 
 LENSES = [
     ("none", []),
@@ -134,7 +134,7 @@ def assert_exact(rig, masks, voxel_m, band_m):
 
 def agree(silhouettes, rig, voxel_m, band_m, every, keep_second):
     """`evaluate` finds what `every_voxel` found; returns how many voxels there are."""
-    found, first, second, who = evaluate(silhouettes, rig, voxel_m, band_m, keep_second)
+    found, first, second, who = evaluate(silhouettes, band_m, keep_second)
     indices, distances, largest, unsure = every[0], every[1], every[2], every[3].copy()
     assert unsure.mean() < 0.2
     seen = np.isfinite(distances).sum(axis=0)
@@ -227,9 +227,9 @@ def test_changed_masks_are_evaluated_again_as_if_from_scratch():
             cv2.circle(mask, tuple(int(n) for n in rng.uniform(0, 1, 2) * mask.shape[::-1]), rng.integers(2, 15), 1, -1)
             changes[int(c)] = mask
         after = before.with_masks(changes)
-        voxels = evaluate(before, rig, 0.08, 0.12)
-        again = evaluate_again(voxels, before, after, rig, 0.08, 0.12)
-        scratch = evaluate(after, rig, 0.08, 0.12)
+        voxels = evaluate(before, 0.12)
+        again = evaluate_again(voxels, before, after, 0.12)
+        scratch = evaluate(after, 0.12)
         for mine, theirs in zip(in_order(again), in_order(scratch), strict=True):
             np.testing.assert_array_equal(mine, theirs)
         assert_exact(rig, dict(zip(after.names, after.masks, strict=True)), 0.16, 0.12)
@@ -259,7 +259,7 @@ def test_a_projection_worked_by_hand():
     wide = np.zeros((101, 101), np.uint8)
     wide[5:96, 5:96] = 255
     silhouettes = measured(rig, {"front": column, "side": wide}, HullConfig(voxel_m=0.1, band_m=0.1))
-    indices, first, _, who = evaluate(silhouettes, rig, 0.1, 0.1)
+    indices, first, _, who = evaluate(silhouettes, 0.1)
     values = {tuple(map(int, i)): (float(d), int(w)) for i, d, w in zip(indices, first, who, strict=True)}
     distance, camera = values[20, 0, 0]
     assert distance == pytest.approx((50 - 5 / 2.05 - 45.5) * 2.05 / 100, abs=1e-6)
@@ -299,7 +299,7 @@ def test_folded_points_have_no_say():
     empty = np.zeros((81, 81), np.uint8)
     empty[78:, 78:] = 1
     silhouettes = measured(rig, {**masks, "fold": empty}, HullConfig(voxel_m=0.1))
-    indices, first, _, _ = evaluate(silhouettes, rig, 0.1, 0.06)
+    indices, first, _, _ = evaluate(silhouettes, 0.06)
     at = (indices == np.floor(point / 0.1).astype(int)).all(axis=1)
     assert at.any() and first[at] < 0
 
@@ -442,11 +442,11 @@ def test_who_cut_a_hull_whose_mask_was_mended():
     masks["cam1"] = ball_masks(rig, BODY)["cam1"]
     config = dataclasses.replace(CONFIG, shared_veto=0.0)
     silhouettes = measured(rig, masks, config)
-    voxels = evaluate(silhouettes, rig, config.voxel_m, config.band_m)
+    voxels = evaluate(silhouettes, config.band_m)
     covered = hulls.cover_silhouettes(silhouettes, voxels, config)
     mended = hulls.mend_silhouettes(silhouettes, covered, voxels, config)
     assert mended is not silhouettes
-    indices, _, _, who = evaluate(mended, rig, config.voxel_m, config.band_m)
+    indices, _, _, who = evaluate(mended, config.band_m)
     expected = {tuple(index): int(w) for index, w in zip(indices.tolist(), who, strict=True)}
     hull = carve(masks, rig, config)
     for index, w in zip(*who_cut(hull), strict=True):
@@ -521,7 +521,7 @@ def test_taking_out_cameras_leaves_what_the_others_measure():
     assert rest.margins[0] > everyone.margins[0]
     silhouettes = everyone.without("cam1", "here").without("cam5", "there")
     assert silhouettes.rejected == {"cam1": "here", "cam5": "there"} and silhouettes.names == rest.names
-    mine, theirs = (in_order(evaluate(one, rig, 0.04, 0.06)) for one in (silhouettes, rest))
+    mine, theirs = (in_order(evaluate(one, 0.06)) for one in (silhouettes, rest))
     for one, other in zip(mine, theirs, strict=True):
         np.testing.assert_array_equal(one, other)
 
@@ -583,7 +583,7 @@ def test_a_limb_that_one_mask_lost_is_given_back(eight):
 
         assert arm_voxels(hull) > 0.8 * arm_voxels(whole)
         lost = measured(rig, {**masks, name: alone[name]}, config)
-        strict = evaluate(lost, rig, 0.03, 0.06)
+        strict = evaluate(lost, 0.06)
         inside = strict[0][strict[1] < 0]
         assert (inside[:, 0] > 0.4 / 0.03).sum() < 0.5 * arm_voxels(whole)
 
@@ -591,7 +591,7 @@ def test_a_limb_that_one_mask_lost_is_given_back(eight):
 def test_clean_masks_stay_the_very_same(eight):
     rig, masks, _ = eight
     silhouettes = measured(rig, masks, CONFIG)
-    voxels = evaluate(silhouettes, rig, CONFIG.voxel_m, CONFIG.band_m)
+    voxels = evaluate(silhouettes, CONFIG.band_m)
     covered = hulls.cover_silhouettes(silhouettes, voxels, CONFIG)
     assert hulls.unexplained_fraction(silhouettes, covered) == 0.0
     assert hulls.mend_silhouettes(silhouettes, covered, voxels, CONFIG) is silhouettes
@@ -601,7 +601,7 @@ def test_cover_paints_squares_around_voxels(eight):
     """Against squares painted pixel by pixel."""
     rig, masks, _ = eight
     silhouettes = measured(rig, masks, CONFIG)
-    voxels = evaluate(silhouettes, rig, CONFIG.voxel_m, CONFIG.band_m)
+    voxels = evaluate(silhouettes, CONFIG.band_m)
     covered = hulls.cover_silhouettes(silhouettes, voxels, CONFIG)
     points = (voxels[0][voxels[1] < 0] + 0.5) * CONFIG.voxel_m
     for c, name in enumerate(silhouettes.names):
@@ -688,7 +688,7 @@ def test_largest_component_keeps_a_single_one_and_bridges_small_gaps():
 
 def test_lattice_bounds_hold_the_centres_in_the_volume():
     rig = dataclasses.replace(ring(2), volume_min=np.array([-1.0, -0.99, 0.0]), volume_max=np.array([1.0, 1.0, 2.04]))
-    low, high = hulls.lattice_bounds(rig, 0.1)
+    low, high = lattice_bounds(rig, 0.1)
     assert low.tolist() == [-10, -10, 0] and high.tolist() == [10, 10, 20]
 
 
@@ -696,6 +696,6 @@ def test_the_warm_up_mends_too():
     """Else the first frame with a broken mask would wait for a compiler."""
     rig, config = pipeline._warm_up_room()
     silhouettes = measured(rig, pipeline._warm_up_masks(), config)
-    voxels = evaluate(silhouettes, rig, config.voxel_m, config.band_m)
+    voxels = evaluate(silhouettes, config.band_m)
     covered = hulls.cover_silhouettes(silhouettes, voxels, config)
     assert hulls.mend_silhouettes(silhouettes, covered, voxels, config) is not silhouettes

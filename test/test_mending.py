@@ -21,10 +21,10 @@ def four(request: pytest.FixtureRequest) -> Case:
 def volumes(case: Case, masks: dict[str, np.ndarray]) -> tuple[int, int]:
     """Inside voxels of the strict intersection, and after mending."""
     silhouettes = measure_silhouettes(masks, case.rig, pack_cameras(case.rig), CONFIG)
-    voxels = hull.evaluate(silhouettes, case.rig, CONFIG.voxel_m, CONFIG.band_m)
+    voxels = hull.evaluate(silhouettes, CONFIG.band_m)
     covered = hull.cover_silhouettes(silhouettes, voxels, CONFIG)
     mended = hull.mend_silhouettes(silhouettes, covered, voxels, CONFIG)
-    after = hull.evaluate(mended, case.rig, CONFIG.voxel_m, CONFIG.band_m)
+    after = hull.evaluate(mended, CONFIG.band_m)
     return int((voxels[1] < 0).sum()), int((after[1] < 0).sum())
 
 

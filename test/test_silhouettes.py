@@ -5,6 +5,7 @@ import cv2
 import numpy as np
 import pytest
 
+from limbloc_ros.core import _silhouettes_kernels as kernels
 from limbloc_ros.core.camera import Camera, Rig
 from limbloc_ros.core.config import HullConfig
 from limbloc_ros.core.errors import RigError
@@ -51,6 +52,34 @@ def test_distances_of_noise_are_exact():
         if mask.all() or not mask.any():
             continue
         assert (signed_distance_px(mask) == exact_distance(mask)).all()
+
+
+@pytest.mark.parametrize("most", [1, 2, 5, 17])
+def test_distances_beyond_the_most_are_the_most(most):
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        mask = np.zeros(rng.integers(2, 50, 2), np.uint8)
+        for _ in range(3):
+            cv2.circle(mask, tuple(int(n) for n in rng.uniform(0, 1, 2) * mask.shape[::-1]), rng.integers(1, 9), 1, -1)
+        if mask.all():
+            continue
+        exact, out = exact_distance(mask), np.full(mask.shape, np.nan, np.float32)
+        assert kernels.signed_distance(mask, most, 100, np.empty(0, np.uint16), out)
+        np.testing.assert_array_equal(out, np.minimum(exact, np.float32(most - 0.5)))
+        assert kernels.signed_distance(mask, most, 3, np.empty(0, np.int32), out) == (exact.min() > -2.5)
+        np.testing.assert_array_equal(out, np.clip(exact, -2.5, np.float32(most - 0.5)))
+
+
+@pytest.mark.parametrize("shape", [(900, 3), (3, 900), (400, 400), (360, 360)])
+def test_distances_too_large_for_sixteen_bits(shape):
+    """A mask that is foreground but for its corner, and the other way round: everything is as far as that corner."""
+    mask = np.ones(shape, np.uint8)
+    mask[0, 0] = 0
+    y, x = np.indices(shape)
+    expected = np.where(mask > 0, np.float32(0.5) - np.sqrt(np.float32(x**2 + y**2)), np.float32(0.5))
+    np.testing.assert_array_equal(signed_distance_px(mask), expected)
+    expected = np.where(mask > 0, -expected, -np.float32(0.5))
+    np.testing.assert_array_equal(signed_distance_px(1 - mask), expected)
 
 
 def test_distances_near_opencv_on_a_large_mask():
@@ -125,7 +154,8 @@ def test_pieces_end_where_nothing_nearer_than_the_band_can_be_seen(x):
     margin = min(95 - x0, 60 - y0, x0 + width - 105, y0 + height - 90)
     assert margin * nearest / 100.0 >= 0.06
     assert margin <= 100 * 0.06 / (0.5 * nearest) + 4
-    np.testing.assert_array_equal(silhouettes.piece(0), exact_distance(silhouettes.masks[0])[y0:, x0:][:height, :width])
+    exact = exact_distance(silhouettes.masks[0])[y0:, x0:][:height, :width]
+    np.testing.assert_array_equal(silhouettes.piece(0), np.minimum(exact, silhouettes.margins[0] - 0.5))
 
 
 def test_a_camera_in_the_volume_keeps_its_whole_image():
@@ -139,12 +169,21 @@ def test_masks_that_grow_get_larger_pieces():
     after = silhouettes.with_masks({0: grown})
     x0, y0, width, height, _ = after.boxes[0]
     assert y0 < 20 and after.masks[0] is grown
-    np.testing.assert_array_equal(after.piece(0), exact_distance(grown)[y0:, x0:][:height, :width])
-    left, top, right, bottom = after.changes_since(silhouettes)[0]
-    # From the new tip's margin to where the old top's influence ends, one pixel more on each side.
-    assert top == y0 - 1 or top >= 20 - after.margins[0] - 1
-    assert left < 98 < 101 < right and 60 < bottom < 90
-    assert silhouettes.with_masks({}).changes_since(silhouettes).tolist() == [[0, 0, -1, -1]]
+    exact = exact_distance(grown)[y0:, x0:][:height, :width]
+    np.testing.assert_array_equal(after.piece(0), np.minimum(exact, after.margins[0] - 0.5))
+    changes = after.changes_since(silhouettes)
+    left, top, columns, rows, _ = changes.frames[0]
+    # From the new tip's margin to where the old top's influence ends.
+    assert top == y0 or top >= 20 - after.margins[0]
+    assert left < 98 < 101 < left + columns and 60 < top + rows < 90
+    counted = np.diff(np.diff(changes.sums.reshape(rows + 1, columns + 1), axis=0), axis=1)
+    before = np.full(after.masks[0].shape, np.inf)
+    x, y, width, height, _ = silhouettes.boxes[0]
+    before[y : y + height, x : x + width] = silhouettes.piece(0)
+    nearer = (exact_distance(grown) < before) & (exact_distance(grown) < after.margins[0] - 0.5)
+    np.testing.assert_array_equal(counted > 0, nearer[top : top + rows, left : left + columns])
+    assert nearer.sum() == counted.sum()
+    assert not silhouettes.with_masks({}).changes_since(silhouettes).frames[:, 2:].any()
 
 
 def test_most_cameras_must_see_a_voxel():

@@ -12,7 +12,7 @@ from numba import njit
 from limbloc_ros.core._projection_kernels import project, project_block, row_start
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def cover(points: Any, reach: float, cams: Any, boxes: Any, covered: Any) -> None:
     """Mark the pixels, laid out like `field`, that squares of `reach` (m) around the points [3, P] cover."""
     run = np.zeros(len(covered), np.int16)  # longest run of covered pixels that begins at a pixel
@@ -55,7 +55,7 @@ def cover(points: Any, reach: float, cams: Any, boxes: Any, covered: Any) -> Non
                 at += 1
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def count_bare(field: Any, covered: Any, boxes: Any, inner_px: float) -> Any:
     """Foreground pixels of every camera that lie deeper than its rim: all, and those not covered; int64 [C, 2]."""
     out = np.zeros((len(boxes), 2), np.int64)
@@ -72,7 +72,7 @@ def count_bare(field: Any, covered: Any, boxes: Any, inner_px: float) -> Any:
     return out
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def count_unexplained(
     points: Any, deniers: Any, cams: Any, boxes: Any, field: Any, covered: Any, inner_px: float
 ) -> Any:
@@ -95,7 +95,7 @@ def count_unexplained(
     return out
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def paint_balls(points: Any, radii: Any, cams: Any, c: int, mask: Any) -> None:
     """Set to 1 the pixels of one camera's mask (uint8 [height, width]) that the balls cover."""
     height, width = mask.shape

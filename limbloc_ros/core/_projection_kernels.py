@@ -9,7 +9,7 @@ from typing import Any
 from numba import njit
 
 # Columns of the packed camera table: R (9), t (3), fx fy cx cy, distortion kind, 14 coefficients, width, height, square
-# of the lens's range, the lens's largest enlargement (see `lens`).
+# of the lens's range (see `lens`; without distortion of the image's furthest corner), the lens's largest enlargement.
 CAMERA_COLUMNS = 35
 NONE, POLYNOMIAL, FISHEYE = 0.0, 1.0, 2.0
 # How a block of space lies to a camera.
@@ -18,7 +18,7 @@ UNKNOWN, UNSEEN, PARTLY, WITHIN = 0, 1, 2, 3
 CLOSEST = 0.05
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def distort(cams: Any, c: int, a: float, b: float) -> tuple[float, float]:
     """Normalised coordinates in the lens's range -> pixel."""
     kind = cams[c, 16]
@@ -41,7 +41,7 @@ def distort(cams: Any, c: int, a: float, b: float) -> tuple[float, float]:
     return cams[c, 12] * a + cams[c, 14], cams[c, 13] * b + cams[c, 15]
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def row_start(cams: Any, c: int, x: float, y: float) -> tuple[float, float, float]:
     """The part of a point's camera coordinates that all points with the same x and y share."""
     return (
@@ -51,7 +51,7 @@ def row_start(cams: Any, c: int, x: float, y: float) -> tuple[float, float, floa
     )
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def project(cams: Any, c: int, start: tuple[float, float, float], z: float) -> tuple[float, float, float]:
     """World point, given as `row_start` and its z (m) -> pixel (u, v) and depth (m); depth 0 is not seen."""
     depth = start[2] + cams[c, 8] * z
@@ -68,61 +68,62 @@ def project(cams: Any, c: int, start: tuple[float, float, float], z: float) -> t
     return u, v, depth
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
-def view_of_ball(
-    cams: Any, c: int, x: float, y: float, z: float, radius: float
-) -> tuple[int, float, float, float, float]:
-    """How a ball (m) lies to a camera: UNSEEN or WITHIN the image wholly, PARTLY, or UNKNOWN.
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def view_of_balls(cams: Any, c: int, centres: Any, radius: float, count: int, views: Any) -> None:
+    """How the first `count` balls of one radius (`centres` [3, B], m) lie to a camera, to `views` [5, B].
 
-    With the latter two come the centre's pixel (u, v), `reach` (px) and the nearest depth (m): every point of the ball
-    is seen at most `reach` from (u, v). A point that is d from the centre differs from it by at most
-    d / nearest depth * sqrt(1 + a^2 + b^2) in normalised coordinates (a, b: those of the centre), and the lens enlarges
-    that by a known factor at most.
+    Rows 0 and 1: the centre's pixel (u, v). Row 2: the nearest depth, m. Row 3: `reach` (px): every point of the ball
+    is seen at most that far from (u, v). Row 4: UNSEEN or WITHIN the image wholly, PARTLY, or UNKNOWN; what the other
+    rows say of balls that are UNSEEN or UNKNOWN means nothing, but that the latter's depth is 0.
+
+    A point that is d from the centre differs from it by at most d / nearest depth * sqrt(1 + a^2 + b^2) in normalised
+    coordinates (a, b: those of the centre), and the lens enlarges that by a known factor at most.
     """
-    sx, sy, sz = row_start(cams, c, x, y)
-    depth = sz + cams[c, 8] * z
-    if depth < -radius:
-        return UNSEEN, 0.0, 0.0, 0.0, 0.0
-    near = depth - radius
-    if near < CLOSEST:
-        return UNKNOWN, 0.0, 0.0, 0.0, 0.0
-    a = (sx + cams[c, 2] * z) / depth
-    b = (sy + cams[c, 5] * z) / depth
-    off = a * a + b * b
-    reach = radius / near * math.sqrt(1.0 + off)
-    if cams[c, 16] != 0.0:
-        limit = math.sqrt(cams[c, 33])
-        off = math.sqrt(off)
-        if off - reach > limit:
-            return UNSEEN, 0.0, 0.0, 0.0, 0.0
-        if off + reach > limit:
-            return UNKNOWN, 0.0, 0.0, 0.0, 0.0
-        reach *= cams[c, 34]
-    u, v = distort(cams, c, a, b)
-    reach *= max(cams[c, 12], cams[c, 13])
-    right = cams[c, 31] - 1.0
-    bottom = cams[c, 32] - 1.0
-    if u < -reach or v < -reach or u > right + reach or v > bottom + reach:
-        return UNSEEN, 0.0, 0.0, 0.0, 0.0
-    if u < reach or v < reach or u > right - reach or v > bottom - reach:
-        return PARTLY, u, v, reach, near
-    return WITHIN, u, v, reach, near
-
-
-@njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
-def project_block(cams: Any, c: int, points: Any, seen: Any) -> None:
-    """Pixels u, v (rows 0 and 1 of `seen`) of points [3, P], and m per px there (row 2); 0 is not seen."""
-    fx, fy, cx, cy = cams[c, 12], cams[c, 13], cams[c, 14], cams[c, 15]
-    if cams[c, 16] == FISHEYE:
-        for m in range(points.shape[1]):
-            start = row_start(cams, c, points[0, m], points[1, m])
-            seen[0, m], seen[1, m], depth = project(cams, c, start, points[2, m])
-            seen[2, m] = depth / fx
-        return
-    # The same as `project`. With one array to read and one to write, and no branch, these loops become vector code.
     r00, r01, r02, t0 = cams[c, 0], cams[c, 1], cams[c, 2], cams[c, 9]
     r10, r11, r12, t1 = cams[c, 3], cams[c, 4], cams[c, 5], cams[c, 10]
     r20, r21, r22, t2 = cams[c, 6], cams[c, 7], cams[c, 8], cams[c, 11]
+    limit = math.sqrt(cams[c, 33])
+    known = math.inf if cams[c, 16] == NONE else limit
+    enlarged = max(cams[c, 12], cams[c, 13]) * cams[c, 34]
+    for n in range(count):
+        x, y, z = centres[0, n], centres[1, n], centres[2, n]
+        depth = r20 * x + r21 * y + t2 + r22 * z
+        a = r00 * x + r01 * y + t0 + r02 * z
+        b = r10 * x + r11 * y + t1 + r12 * z
+        away = math.sqrt(a * a + b * b)
+        # Behind the camera, or outside the cone in which it sees anything: the latter also for balls beside it.
+        unseen = depth < -radius or away - radius > limit * (depth + radius)
+        inverse = 1.0 / depth
+        a *= inverse
+        b *= inverse
+        near = depth - radius
+        off = away * inverse
+        reach = radius / near * math.sqrt(1.0 + off * off)
+        how = UNKNOWN if near < CLOSEST or off + reach > known else WITHIN
+        how = UNSEEN if unseen else how
+        views[0, n], views[1, n], views[2, n], views[3, n], views[4, n] = a, b, near, reach * enlarged, how
+    to_pixels(cams, c, views[:, :count])
+    right = cams[c, 31] - 1.0
+    bottom = cams[c, 32] - 1.0
+    for n in range(count):
+        u, v, reach, how = views[0, n], views[1, n], views[3, n], views[4, n]
+        inmost = min(min(u, right - u), min(v, bottom - v))
+        seen = WITHIN if inmost >= reach else PARTLY
+        seen = UNSEEN if inmost < -reach else seen
+        views[2, n] = 0.0 if how == UNKNOWN else views[2, n]
+        views[4, n] = seen if how == WITHIN else how
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def project_block(cams: Any, c: int, points: Any, seen: Any) -> None:
+    """Pixels u, v (rows 0 and 1 of `seen`) of points [3, P], and m per px there (row 2); 0 is not seen.
+
+    The same as `project`. With one array to read and one to write, and no branch, these loops become vector code.
+    """
+    r00, r01, r02, t0 = cams[c, 0], cams[c, 1], cams[c, 2], cams[c, 9]
+    r10, r11, r12, t1 = cams[c, 3], cams[c, 4], cams[c, 5], cams[c, 10]
+    r20, r21, r22, t2 = cams[c, 6], cams[c, 7], cams[c, 8], cams[c, 11]
+    scale = 1.0 / cams[c, 12]
     for m in range(points.shape[1]):
         x = points[0, m]
         y = points[1, m]
@@ -131,31 +132,48 @@ def project_block(cams: Any, c: int, points: Any, seen: Any) -> None:
         inverse = 1.0 / depth
         seen[0, m] = (r00 * x + r01 * y + t0 + r02 * z) * inverse
         seen[1, m] = (r10 * x + r11 * y + t1 + r12 * z) * inverse
-        seen[2, m] = depth / fx if depth > 1e-6 else 0.0
+        seen[2, m] = depth * scale if depth > 1e-6 else 0.0
+    to_pixels(cams, c, seen)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def to_pixels(cams: Any, c: int, seen: Any) -> None:
+    """Normalised coordinates (rows 0 and 1 of `seen`) -> pixels; row 2 becomes 0 beyond the lens's range."""
+    fx, fy, cx, cy = cams[c, 12], cams[c, 13], cams[c, 14], cams[c, 15]
+    limit = cams[c, 33]
+    if cams[c, 16] == FISHEYE:
+        for m in range(seen.shape[1]):
+            a, b = seen[0, m], seen[1, m]
+            if seen[2, m] == 0.0 or a * a + b * b > limit:
+                seen[2, m] = 0.0
+            else:
+                seen[0, m], seen[1, m] = distort(cams, c, a, b)
+        return
     if cams[c, 16] == POLYNOMIAL:
         k1, k2, p1, p2, k3 = cams[c, 17], cams[c, 18], cams[c, 19], cams[c, 20], cams[c, 21]
         k4, k5, k6 = cams[c, 22], cams[c, 23], cams[c, 24]
         s1, s2, s3, s4 = cams[c, 25], cams[c, 26], cams[c, 27], cams[c, 28]
-        limit = cams[c, 33]
         if k4 == k5 == k6 == s1 == s2 == s3 == s4 == 0.0:
             # Most lenses: the same numbers without their zeros, above all without a division by 1. Twice as fast.
-            for m in range(points.shape[1]):
+            for m in range(seen.shape[1]):
                 a = seen[0, m]
                 b = seen[1, m]
+                scale = seen[2, m]
                 r2 = a * a + b * b
                 radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
                 seen[0, m] = fx * (a * radial + 2.0 * p1 * a * b + p2 * (r2 + 2.0 * a * a)) + cx
                 seen[1, m] = fy * (b * radial + p1 * (r2 + 2.0 * b * b) + 2.0 * p2 * a * b) + cy
-                seen[2, m] = 0.0 if r2 > limit else seen[2, m]
+                seen[2, m] = 0.0 if r2 > limit else scale
             return
-        for m in range(points.shape[1]):
+        for m in range(seen.shape[1]):
             a = seen[0, m]
             b = seen[1, m]
+            scale = seen[2, m]
             r2 = a * a + b * b
             radial = (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6)))
             seen[0, m] = a * radial + 2.0 * p1 * a * b + p2 * (r2 + 2.0 * a * a) + s1 * r2 + s2 * r2 * r2
             seen[1, m] = b * radial + p1 * (r2 + 2.0 * b * b) + 2.0 * p2 * a * b + s3 * r2 + s4 * r2 * r2
-            seen[2, m] = 0.0 if r2 > limit else seen[2, m]
-    for m in range(points.shape[1]):
+            seen[2, m] = 0.0 if r2 > limit else scale
+    for m in range(seen.shape[1]):
         seen[0, m] = fx * seen[0, m] + cx
         seen[1, m] = fy * seen[1, m] + cy

@@ -17,22 +17,21 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import find_objects
 
+from limbloc_ros.core import _block_kernels as near
 from limbloc_ros.core import _hull_kernels as kernels
 from limbloc_ros.core import _mending_kernels as mending
+from limbloc_ros.core._hull_kernels import LEAF
 from limbloc_ros.core.camera import Rig
 from limbloc_ros.core.config import HullConfig
 from limbloc_ros.core.errors import InputError, NoPerson
 from limbloc_ros.core.silhouettes import (
-    COARSE,
-    COARSE_BAND,
+    PixelCounts,
     Silhouettes,
     measure_silhouettes,
     min_seen,
     pack_cameras,
 )
 
-#: Coarsest blocks of the hierarchy, in voxels; halved until LEAF.
-ROOT, LEAF = 32, 4
 #: A silhouette's rim of this width is not asked whether the hull explains it: voxels are coarser than pixels.
 INNER_PX = 1.5
 #: Fraction of unexplained foreground from which on the cameras contradict each other as much as we distinguish.
@@ -140,63 +139,42 @@ class Hull:
         return replace(hull, cut_by=grid, viewpoints=viewpoints)
 
 
-def lattice_bounds(rig: Rig, voxel_m: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Lowest and highest (exclusive) lattice indices whose voxel centres lie in the carve volume."""
-    low = np.ceil(rig.volume_min / voxel_m - 0.5 - 1e-9).astype(np.int64)
-    high = np.floor(rig.volume_max / voxel_m - 0.5 + 1e-9).astype(np.int64) + 1
-    return low, high
-
-
 def evaluate(
-    silhouettes: Silhouettes,
-    rig: Rig,
-    voxel_m: float,
-    band_m: float,
-    keep_second: bool = True,
-    changed: NDArray[np.float64] | None = None,
+    silhouettes: Silhouettes, band_m: float, keep_second: bool = True, changed: PixelCounts | None = None
 ) -> Voxels:
-    """Signed distances of every voxel near the hull, by halving blocks that may hold some of it.
+    """Signed distances of every voxel near the hull, in the blocks that may hold some of it.
 
     Exact: the same voxels and values as the evaluation of every voxel of the volume. A voxel must be seen by more
     than half of the cameras.
 
     Args:
         silhouettes: as measured, for a band not narrower than band_m.
-        rig: the carve volume is read.
-        voxel_m: edge length of a voxel.
         band_m: how far outside the hull voxels are wanted.
         keep_second: whether voxels that a single camera denies are wanted too.
-        changed: only blocks that a camera may see in its rectangle of these (see `Silhouettes.changes_since`).
+        changed: only blocks that may read one of these pixels (see `Silhouettes.changes_since`).
 
     Returns:
         indices int32 [V, 3], largest camera distance float32 [V] m, second largest float32 [V] m, and the index of
         the camera that gave the largest int16 [V]; all voxels whose largest distance is below band_m or, with
         keep_second, whose second largest is negative (those that a single camera denies).
     """
-    low, high = lattice_bounds(rig, voxel_m)
-    seen = min_seen(len(silhouettes.names))
-    axes = [np.arange(low[a], high[a], ROOT, dtype=np.int32) for a in range(3)]
-    blocks = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    table = (silhouettes.cameras, silhouettes.boxes, silhouettes.field)
-    size = ROOT
-    while True:
-        if changed is not None:
-            blocks = kernels.blocks_in_changes(blocks, size, voxel_m, silhouettes.cameras, changed)
-        if size == LEAF:
-            break
-        blocks = kernels.split_blocks(blocks, size, *table, voxel_m, band_m, keep_second, seen)
-        size //= 2
-    return kernels.evaluate_blocks(blocks, size, *table, voxel_m, band_m, keep_second, seen, high)  # type: ignore[no-any-return]
+    seen, voxel_m, cameras = min_seen(len(silhouettes.names)), silhouettes.voxel_m, silhouettes.cameras
+    blocks = silhouettes.blocks
+    if changed is not None:
+        blocks = blocks[near.blocks_in_changes(blocks, LEAF, voxel_m, cameras, changed.frames, changed.sums)]
+    table = (cameras, silhouettes.boxes, silhouettes.field)
+    return kernels.evaluate_blocks(  # type: ignore[no-any-return]
+        blocks, *table, voxel_m, band_m, keep_second, seen, silhouettes.lattice[1]
+    )
 
 
-def evaluate_again(
-    voxels: Voxels, before: Silhouettes, silhouettes: Silhouettes, rig: Rig, voxel_m: float, band_m: float
-) -> Voxels:
+def evaluate_again(voxels: Voxels, before: Silhouettes, silhouettes: Silhouettes, band_m: float) -> Voxels:
     """What `evaluate` finds, but for the voxels' order, from what it found before some silhouettes grew."""
     changed = silhouettes.changes_since(before)
-    new = evaluate(silhouettes, rig, voxel_m, band_m, changed=changed)
-    low, _ = lattice_bounds(rig, voxel_m)
-    same = ~kernels.voxels_in_changes(voxels[0], low, ROOT, LEAF, voxel_m, silhouettes.cameras, changed)
+    new = evaluate(silhouettes, band_m, changed=changed)
+    blocks, block_of = near.blocks_of_voxels(voxels[0], silhouettes.lattice[0], LEAF)
+    counts = (changed.frames, changed.sums)
+    same = ~near.blocks_in_changes(blocks, LEAF, silhouettes.voxel_m, silhouettes.cameras, *counts)[block_of]
     return (
         np.concatenate([voxels[0][same], new[0]]),
         np.concatenate([voxels[1][same], new[1]]),
@@ -205,26 +183,25 @@ def evaluate_again(
     )
 
 
-def reject_dead_cameras(silhouettes: Silhouettes, rig: Rig, config: HullConfig) -> Silhouettes:
-    """Take out cameras whose masks contradict all others: without them the hull grows several times.
+def evaluate_live(silhouettes: Silhouettes, config: HullConfig) -> tuple[Silhouettes, Voxels]:
+    """`evaluate` without the cameras whose masks contradict all others: without them the hull grows several times.
 
-    Volumes are compared on voxels COARSE times as large: leaving out camera c adds the voxels that only c denies.
+    Leaving out a camera adds the voxels that only it denies.
     """
-    coarse = COARSE * config.voxel_m
-    while len(silhouettes.names) > max(config.min_cameras, 3):
-        _, first, second, who = evaluate(silhouettes, rig, coarse, COARSE_BAND * config.voxel_m)
-        kept = int((first < 0).sum())
+    while True:
+        voxels = evaluate(silhouettes, config.band_m)
+        _, first, second, who = voxels
+        if len(silhouettes.names) <= max(config.min_cameras, 3):
+            return silhouettes, voxels
+        kept = np.count_nonzero(first < 0)
         denied = np.bincount(who[(first >= 0) & (second < 0)], minlength=len(silhouettes.names))
         worst = int(denied.argmax())
-        if denied[worst] < 2 * kept + config.min_voxels / COARSE**3:
-            break
         others = np.delete(denied, worst)
-        if denied[worst] < 2 * others.max():
-            break
+        if denied[worst] < 2 * kept + config.min_voxels or denied[worst] < 2 * others.max():
+            return silhouettes, voxels
         silhouettes = silhouettes.without(
             silhouettes.names[worst], f"its mask denies {denied[worst] / max(kept, 1):.1f} times the hull that stays"
         )
-    return silhouettes
 
 
 def cover_silhouettes(silhouettes: Silhouettes, voxels: Voxels, config: HullConfig) -> NDArray[np.uint8]:
@@ -299,13 +276,12 @@ def carve_silhouettes(silhouettes: Silhouettes, rig: Rig, config: HullConfig) ->
             f"{len(silhouettes.names)} usable masks of {len(rig.cameras)} cameras, "
             f"expected at least {needed} ({reasons})"
         )
-    silhouettes = reject_dead_cameras(silhouettes, rig, config)
-    voxels = evaluate(silhouettes, rig, config.voxel_m, config.band_m)
+    silhouettes, voxels = evaluate_live(silhouettes, config)
     covered = cover_silhouettes(silhouettes, voxels, config)
     contradiction = unexplained_fraction(silhouettes, covered)
     mended = mend_silhouettes(silhouettes, covered, voxels, config)
     if mended is not silhouettes:
-        voxels = evaluate_again(voxels, silhouettes, mended, rig, config.voxel_m, config.band_m)
+        voxels = evaluate_again(voxels, silhouettes, mended, config.band_m)
     indices, first, second, who = voxels
     # Ragged masks bite a little from every side. The more the cameras contradict each other, the less may a single
     # one decide; with few cameras two vetoes would leave far too much.

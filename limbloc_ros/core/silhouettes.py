@@ -3,27 +3,53 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from limbloc_ros.core import _block_kernels as near
 from limbloc_ros.core import _projection_kernels as projection
 from limbloc_ros.core import _silhouettes_kernels as kernels
+from limbloc_ros.core._hull_kernels import LEAF
 from limbloc_ros.core.camera import Camera, Rig
 from limbloc_ros.core.config import HullConfig
 from limbloc_ros.core.errors import InputError, RigError
 from limbloc_ros.core.lens import lens_range
 
-#: Edge (m) of the cubes of space that are asked how near to a camera a body can be; larger ones in large rooms.
-CUBE_M = 0.3
-MAX_CUBES = 4000
-#: Cameras are judged on voxels COARSE times as large, with a band of so many of the voxels proper.
-COARSE = 3
-COARSE_BAND = 0.5 * COARSE
+#: Coarsest blocks of the hierarchy, in voxels; halved until they are leaves.
+ROOT = 32
+
+
+@dataclass(frozen=True)
+class PixelCounts:
+    """How many pixels of one kind any rectangle of any camera's image holds, from four sums.
+
+    Attributes:
+        frames: int64 [C, 5] x0, y0, width, height of the smallest rectangle around all such pixels of each camera, and
+            the offset of its sums; width 0 where there is none.
+        sums: int32, for each camera [height + 1, width + 1]: how many lie above and left of each pixel's corner.
+    """
+
+    frames: NDArray[np.int64]
+    sums: NDArray[np.int32]
+
+    @staticmethod
+    def of(pieces: Sequence[NDArray[np.uint8]], corners: Sequence[tuple[int, int]] | None = None) -> PixelCounts:
+        """Count the ones of images [height, width] of 0 and 1, or of pieces whose first pixels are `corners`."""
+        frames = np.zeros((len(pieces), 5), np.int64)
+        sums = []
+        offset = 0
+        for c, piece in enumerate(pieces):
+            x, y, width, height = cv2.boundingRect(piece) if piece.size else (0, 0, 0, 0)
+            left, top = corners[c] if corners is not None else (0, 0)
+            frames[c] = left + x, top + y, width, height, offset
+            if width:
+                sums.append(cv2.integral(piece[y : y + height, x : x + width]).ravel())
+                offset += sums[-1].size
+        return PixelCounts(frames, np.concatenate(sums) if sums else np.zeros(0, np.int32))
 
 
 @dataclass(frozen=True)
@@ -38,11 +64,13 @@ class Silhouettes:
         rejected: camera name -> why it does not take part.
         masks: the whole masks, uint8 [height, width], 0 or 1; regions to ignore are foreground, so that nothing is
             carved there.
-        outlines: int64 [C, 4] first column and row, last column and row of each mask's foreground.
-        margins: float64 [C] px from a mask to its piece's border: further out, every point that can matter is further
-            from the silhouette than the band.
-        room: float64 [2, 3] corners of the carve volume, m.
+        counts: how many foreground pixels each mask has up to a pixel.
+        margins: float64 [C] px from a mask to its piece's border, and the largest distance in it: further out, every
+            point that can matter is further from the silhouette than the band.
+        voxel_m: edge length of a voxel, m.
+        lattice: int64 [2, 3] lowest and highest (exclusive) lattice indices in the carve volume.
         band_m: how far outside a silhouette distances are needed, m.
+        blocks: int32 [B, 3] lowest lattice indices of the blocks of LEAF voxels that can hold voxels that matter.
         ignored: uint8 [height, width] of each camera, 1 where its image means nothing; None where it has no such part.
     """
 
@@ -52,10 +80,12 @@ class Silhouettes:
     field: NDArray[np.float32]
     rejected: dict[str, str]
     masks: tuple[NDArray[np.uint8], ...]
-    outlines: NDArray[np.int64]
+    counts: PixelCounts
     margins: NDArray[np.float64]
-    room: NDArray[np.float64]
+    voxel_m: float
+    lattice: NDArray[np.int64]
     band_m: float
+    blocks: NDArray[np.int32]
     ignored: tuple[NDArray[np.uint8] | None, ...]
 
     def piece(self, c: int) -> NDArray[np.float32]:
@@ -66,51 +96,45 @@ class Silhouettes:
     def with_masks(self, masks: Mapping[int, NDArray[np.uint8]]) -> Silhouettes:
         """The same with the whole masks (0 or 1) of some camera numbers replaced."""
         new = tuple(masks.get(c, mask) for c, mask in enumerate(self.masks))
-        outlines = self.outlines.copy()
-        for c, mask in masks.items():
-            outlines[c] = _outline(mask)
-        grown = replace(self, masks=new, outlines=outlines)
-        if not np.array_equal(outlines, self.outlines):
-            grown = replace(grown, margins=_margins(grown))
-        return _cut(grown, self)
+        return _measured(replace(self, masks=new, counts=PixelCounts.of(new)), self)
 
     def without(self, name: str, why: str) -> Silhouettes:
         """The same without one camera."""
         keep = [i for i, other in enumerate(self.names) if other != name]
+        masks = tuple(self.masks[i] for i in keep)
         rest = replace(
             self,
             names=tuple(self.names[i] for i in keep),
             cameras=self.cameras[keep],
             boxes=self.boxes[keep],
             rejected={**self.rejected, name: why},
-            masks=tuple(self.masks[i] for i in keep),
-            outlines=self.outlines[keep],
+            masks=masks,
+            counts=PixelCounts.of(masks),
             margins=self.margins[keep],
             ignored=tuple(self.ignored[i] for i in keep),
         )
-        return _cut(replace(rest, margins=_margins(rest)), rest)
+        return _measured(rest, rest)
 
-    def changes_since(self, before: Silhouettes) -> NDArray[np.float64]:
+    def changes_since(self, before: Silhouettes) -> PixelCounts:
         """Where another distance than before is read, if it is nearer than the margin; the masks may only have grown.
 
         Returns:
-            [C, 4] smallest rectangle of pixels x0, y0, x1, y1 of each camera; empty (x1 < x0) where nothing changed.
+            how many such pixels each image has up to a pixel.
         """
-        changed = np.tile([0.0, 0.0, -1.0, -1.0], (len(self.names), 1))
+        changed, corners = [], []
         for c, mask in enumerate(self.masks):
-            if mask is before.masks[c]:
-                continue
             x, y, width, height, _ = self.boxes[c]
+            corners.append((int(x), int(y)))
+            if mask is before.masks[c]:
+                changed.append(np.zeros((0, 0), np.uint8))
+                continue
             x_old, y_old, width_old, height_old, _ = before.boxes[c]
             x0, x1 = max(x, x_old), min(x + width, x_old + width_old)
             y0, y1 = max(y, y_old), min(y + height, y_old + height_old)
-            old = np.full((height, width), np.inf, np.float32)
+            old = np.full((height, width), self.margins[c] - 0.5, np.float32)
             old[y0 - y : y1 - y, x0 - x : x1 - x] = before.piece(c)[y0 - y_old : y1 - y_old, x0 - x_old : x1 - x_old]
-            new = self.piece(c)
-            left, top, columns, rows = cv2.boundingRect(((new < old) & (new < self.margins[c])).astype(np.uint8))
-            if columns > 0:  # one pixel more: bilinear reading
-                changed[c] = x + left - 1, y + top - 1, x + left + columns, y + top + rows
-        return changed
+            changed.append((self.piece(c) < old).view(np.uint8))
+        return PixelCounts.of(changed, corners)
 
 
 def signed_distance_px(mask: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -120,7 +144,9 @@ def signed_distance_px(mask: NDArray[np.uint8]) -> NDArray[np.float32]:
     transform takes an approximate root where its vectors fit: its last bit depends on the alignment in memory, and
     the same bag would not give the same angles every time. It is also slower for both sides of an outline.)
     """
-    return kernels.signed_distance(np.not_equal(mask, 0).view(np.uint8))  # type: ignore[no-any-return]
+    out = np.empty(mask.shape, np.float32)
+    _measure(np.not_equal(mask, 0).view(np.uint8), sum(mask.shape), out)
+    return out
 
 
 def cleaned(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -180,6 +206,10 @@ def pack_camera(camera: Camera) -> NDArray[np.float64]:
         row[17 : 17 + camera.distortion.size] = camera.distortion
     row[31:33] = camera.width, camera.height
     reach, enlargement = lens_range(camera)
+    if not np.isfinite(reach):
+        corners = np.array([[0.0, 0.0], [camera.width - 1, 0.0], [0.0, camera.height - 1]])
+        corners = np.concatenate([corners, [[camera.width - 1, camera.height - 1]]]) - camera.K[:2, 2]
+        reach = (1 + 1e-9) * float(np.linalg.norm(corners / np.diag(camera.K)[:2], axis=1).max())
     row[33:35] = reach**2, enlargement
     return row
 
@@ -232,13 +262,22 @@ def measure_silhouettes(
         field=np.zeros(0, np.float32),
         rejected=rejected,
         masks=tuple(usable),
-        outlines=np.array([_outline(mask) for mask in usable], np.int64).reshape(-1, 4),
+        counts=PixelCounts.of(usable),
         margins=np.zeros(len(rows)),
-        room=np.stack([rig.volume_min, rig.volume_max]),
-        band_m=max(config.band_m, COARSE_BAND * config.voxel_m),
+        voxel_m=config.voxel_m,
+        lattice=np.stack(lattice_bounds(rig, config.voxel_m)),
+        band_m=config.band_m,
+        blocks=np.zeros((0, 3), np.int32),
         ignored=tuple(ignored),
     )
-    return _cut(replace(whole, margins=_margins(whole)), None) if rows else whole
+    return _measured(whole, None) if rows else whole
+
+
+def lattice_bounds(rig: Rig, voxel_m: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Lowest and highest (exclusive) lattice indices whose voxel centres lie in the carve volume."""
+    low = np.ceil(rig.volume_min / voxel_m - 0.5 - 1e-9).astype(np.int64)
+    high = np.floor(rig.volume_max / voxel_m - 0.5 + 1e-9).astype(np.int64) + 1
+    return low, high
 
 
 def min_seen(cameras: int) -> int:
@@ -246,50 +285,67 @@ def min_seen(cameras: int) -> int:
     return max(min(2, cameras), cameras // 2 + 1)
 
 
-def _cut(whole: Silhouettes, old: Silhouettes | None) -> Silhouettes:
-    """Cut the piece that can matter out of every mask and measure it; `old` has pieces that may still do."""
-    count = len(whole.names)
-    margins = whole.margins.copy()
-    boxes = np.zeros((count, 5), np.int64)
-    pieces = []
-    offset = 0
-    for c, mask in enumerate(whole.masks):
-        if old is not None and mask is old.masks[c] and margins[c] <= old.margins[c]:
-            margins[c] = old.margins[c]
-            boxes[c] = old.boxes[c]
-            pieces.append(old.piece(c).ravel())
-        else:
-            margin = int(margins[c])
-            x0, y0 = np.maximum(whole.outlines[c, :2] - margin, 0)
-            x1, y1 = np.minimum(whole.outlines[c, 2:] + margin + 1, mask.shape[::-1])
-            boxes[c, :4] = x0, y0, x1 - x0, y1 - y0
-            pieces.append(kernels.signed_distance(mask[y0:y1, x0:x1]).ravel())
-        boxes[c, 4] = offset
-        offset += pieces[-1].size
-    return replace(whole, boxes=boxes, margins=margins, field=np.concatenate(pieces))
+def _measured(whole: Silhouettes, old: Silhouettes | None) -> Silhouettes:
+    """Find the blocks near the hull, cut the piece that can matter out of every mask and measure it.
 
-
-def _outline(mask: NDArray[np.uint8]) -> tuple[int, int, int, int]:
-    """First column and row, last column and row of the foreground."""
-    x, y, width, height = cv2.boundingRect(mask)
-    return x, y, x + width - 1, y + height - 1
-
-
-def _margins(whole: Silhouettes) -> NDArray[np.float64]:
-    """Beyond these distances (px) from the masks [C] every point that can matter is further than the band from them.
-
-    The rectangles around the masks alone tell how near to each camera such a point can be.
+    Args:
+        whole: masks and counts are right, all else is replaced.
+        old: has pieces that may still do.
     """
-    table = (whole.cameras, whole.outlines, whole.band_m, min_seen(len(whole.names)))
-    low, high = whole.room
-    edge = max(CUBE_M, float(np.cbrt((high - low).prod() / MAX_CUBES)))
-    axes = [np.arange(low[a] + 0.5 * edge, high[a] + 0.5 * edge, edge) for a in range(3)]
-    cubes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    eighths = np.array(list(np.ndindex(2, 2, 2))) - 0.5
-    kept, _ = kernels.nearest_depths(cubes, 0.5 * edge * math.sqrt(3), *table)
-    cubes = (cubes[kept][:, None] + 0.5 * edge * eighths).reshape(-1, 3)
-    _, nearest = kernels.nearest_depths(cubes, 0.25 * edge * math.sqrt(3), *table)
-    margins = np.array([float(max(mask.shape)) for mask in whole.masks])
+    blocks, nearest = _near_blocks(whole)
+    count = len(whole.names)
+    margins = np.array([float(sum(mask.shape)) for mask in whole.masks])
     seen = nearest > 0
     margins[seen] = np.minimum(margins[seen], np.ceil(whole.cameras[seen, 12] * whole.band_m / nearest[seen]) + 2)
-    return margins
+    boxes = np.zeros((count, 5), np.int64)
+    reused = np.zeros(count, np.bool_)
+    offset = 0
+    for c, mask in enumerate(whole.masks):
+        reused[c] = old is not None and mask is old.masks[c] and margins[c] <= old.margins[c]
+        if old is not None and reused[c]:
+            margins[c] = old.margins[c]
+            boxes[c] = old.boxes[c]
+        else:
+            x, y, width, height, _ = whole.counts.frames[c]
+            margin = int(margins[c])
+            x0, y0 = max(x - margin, 0), max(y - margin, 0)
+            x1, y1 = min(x + width + margin, mask.shape[1]), min(y + height + margin, mask.shape[0])
+            boxes[c, :4] = x0, y0, x1 - x0, y1 - y0
+        boxes[c, 4] = offset
+        offset += int(boxes[c, 2] * boxes[c, 3])
+    field = np.empty(offset, np.float32)
+    measured = replace(whole, boxes=boxes, margins=margins, field=field, blocks=blocks)
+    for c, mask in enumerate(whole.masks):
+        if old is not None and reused[c]:
+            measured.piece(c)[:] = old.piece(c)
+        else:
+            x, y, width, height, _ = boxes[c]
+            piece = np.ascontiguousarray(mask[y : y + height, x : x + width])
+            _measure(piece, int(margins[c]), measured.piece(c))
+    return measured
+
+
+def _measure(mask: NDArray[np.uint8], most: int, out: NDArray[np.float32]) -> None:
+    """Signed distances (px) of a mask of 0 and 1; outside, what is `most` or further away is not told from it."""
+    short = kernels.SHORT_PX
+    if most > short or not kernels.signed_distance(mask, most, short, np.empty(0, np.uint16), out):
+        far = sum(mask.shape)
+        kernels.signed_distance(mask, min(most, far), far, np.empty(0, np.int32), out)
+
+
+def _near_blocks(whole: Silhouettes) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
+    """The blocks of LEAF voxels [B, 3] that can hold voxels that matter, and the nearest one's depth [C] in m.
+
+    Found by halving blocks that may hold some, which the masks alone tell. The depth is inf for cameras that see none.
+    """
+    low, high = whole.lattice
+    axes = [np.arange(low[a], high[a], ROOT, dtype=np.int32) for a in range(3)]
+    blocks = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    table = (whole.cameras, whole.counts.frames, whole.counts.sums, whole.band_m, min_seen(len(whole.names)))
+    size = ROOT
+    while True:
+        blocks = near.near_blocks(blocks, size, whole.voxel_m, *table)
+        if size == LEAF:
+            return blocks, near.nearest_depths(blocks, size, whole.voxel_m, whole.cameras)
+        blocks = near.split_blocks(blocks, size, high)
+        size //= 2

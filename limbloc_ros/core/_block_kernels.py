@@ -1,0 +1,152 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Numba kernels that find the blocks of voxels near the hull; `silhouettes` documents, these trust their caller.
+
+All they know of a mask is how many foreground pixels a rectangle holds, from four sums (`sums`, laid out like
+`cv2.integral` does): enough to say that a block lies further than the band outside, and much less work than distances.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from limbloc_ros.core._projection_kernels import UNKNOWN, UNSEEN, WITHIN, view_of_balls
+
+#: Where no foreground lies within r px of a point, its bilinear distance is larger than r less this: the four pixels
+#: around the point may lie 1.42 nearer (0.71 on average), and it is half a pixel from the outline to the foreground.
+NEARER_PX = 1.5
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def block_balls(blocks: Any, size: int, voxel: float) -> tuple[Any, float]:
+    """Centres [3, B] m and radius of the balls around the voxel centres of blocks (lowest lattice indices [B, 3])."""
+    centres = np.empty((3, len(blocks)))
+    for n in range(len(blocks)):
+        for axis in range(3):
+            centres[axis, n] = (blocks[n, axis] + 0.5 * size) * voxel
+    return centres, 0.5 * (size - 1) * voxel * 1.7320508075688774 * (1.0 + 1e-9)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def counts_any(frames: Any, sums: Any, c: int, u: float, v: float, r: float) -> bool:
+    """Whether a pixel within r of (u, v), along both axes, was counted.
+
+    `frames[c]` is (x0, y0, width, height, offset) of the counted rectangle; none was outside it.
+    """
+    left, above, width, height, offset = frames[c, 0], frames[c, 1], frames[c, 2], frames[c, 3], frames[c, 4]
+    x0 = max(math.ceil(u - r) - left, 0)
+    y0 = max(math.ceil(v - r) - above, 0)
+    x1 = min(math.floor(u + r) + 1 - left, width)
+    y1 = min(math.floor(v + r) + 1 - above, height)
+    if x0 >= x1 or y0 >= y1:
+        return False
+    top = offset + y0 * (width + 1)
+    bottom = offset + y1 * (width + 1)
+    found: bool = sums[bottom + x1] - sums[bottom + x0] != sums[top + x1] - sums[top + x0]
+    return found
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def near_blocks(
+    blocks: Any, size: int, voxel: float, cams: Any, frames: Any, sums: Any, band: float, min_seen: int
+) -> Any:
+    """Those of the blocks (cubes of `size` voxels) that may hold a wanted voxel.
+
+    Wanted is a voxel whose largest camera distance is below `band` or whose second largest is negative. The 2D distance
+    changes by at most one pixel a pixel, so nothing is lost. The cameras are asked one after the other, each only
+    about the blocks that are left.
+    """
+    centres, radius = block_balls(blocks, size, voxel)
+    views = np.empty((5, len(blocks)))
+    left = np.arange(len(blocks))
+    tallies = np.zeros((3, len(blocks)), np.int64)  # cameras beyond the outline, beyond the band, that do not see
+    count = len(blocks)
+    for c in range(len(cams)):
+        view_of_balls(cams, c, centres, radius, count, views)
+        kept = 0
+        for n in range(count):
+            outside, beyond, unseen = tallies[0, n], tallies[1, n], tallies[2, n]
+            u, v, near, reach = views[0, n], views[1, n], views[2, n], views[3, n] + NEARER_PX
+            if views[4, n] == UNSEEN:
+                unseen += 1
+            elif views[4, n] == WITHIN and not counts_any(frames, sums, c, u, v, reach):
+                outside += 1
+                beyond += not counts_any(frames, sums, c, u, v, reach + band * cams[c, 12] / near)
+            if (beyond > 0 and outside > 1) or len(cams) - unseen < min_seen:
+                continue
+            centres[0, kept], centres[1, kept], centres[2, kept] = centres[0, n], centres[1, n], centres[2, n]
+            tallies[0, kept], tallies[1, kept], tallies[2, kept] = outside, beyond, unseen
+            left[kept] = left[n]
+            kept += 1
+        count = kept
+    return blocks[left[:count]]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def split_blocks(blocks: Any, size: int, upper: Any) -> Any:
+    """The eight halves of blocks of `size` voxels that begin below `upper` (lattice, exclusive)."""
+    out = np.empty((len(blocks) * 8, 3), np.int32)
+    count = 0
+    half = size // 2
+    for n in range(len(blocks)):
+        for eighth in range(8):
+            i = blocks[n, 0] + (eighth & 1) * half
+            j = blocks[n, 1] + ((eighth >> 1) & 1) * half
+            k = blocks[n, 2] + (eighth >> 2) * half
+            if i < upper[0] and j < upper[1] and k < upper[2]:
+                out[count, 0], out[count, 1], out[count, 2] = i, j, k
+                count += 1
+    return out[:count]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def nearest_depths(blocks: Any, size: int, voxel: float, cams: Any) -> Any:
+    """The least depth (m) at which each camera may see a voxel of the blocks; inf if it sees none."""
+    centres, radius = block_balls(blocks, size, voxel)
+    views = np.empty((5, len(blocks)))
+    nearest = np.full(len(cams), np.inf)
+    for c in range(len(cams)):
+        view_of_balls(cams, c, centres, radius, len(blocks), views)
+        for n in range(len(blocks)):
+            if views[4, n] != UNSEEN:
+                nearest[c] = min(nearest[c], views[2, n])
+    return nearest
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def blocks_in_changes(blocks: Any, size: int, voxel: float, cams: Any, frames: Any, sums: Any) -> Any:
+    """Which blocks have a voxel that may read a changed pixel, bool [B]; `frames` and `sums` count what changed."""
+    centres, radius = block_balls(blocks, size, voxel)
+    views = np.empty((5, len(blocks)))
+    out = np.zeros(len(blocks), np.bool_)
+    for c in range(len(cams)):
+        if frames[c, 2] == 0:
+            continue
+        view_of_balls(cams, c, centres, radius, len(blocks), views)
+        for n in range(len(blocks)):
+            u, v, reach, how = views[0, n], views[1, n], views[3, n] + 1.0, views[4, n]  # 1 px more: bilinear reading
+            out[n] |= how == UNKNOWN or (how != UNSEEN and counts_any(frames, sums, c, u, v, reach))
+    return out
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def blocks_of_voxels(indices: Any, lower: Any, size: int) -> tuple[Any, Any]:
+    """The blocks [B, 3] in which voxels [V, 3] lie, from `lower` on, and the block of each, int64 [V].
+
+    The voxels come in the order in which `evaluate_blocks` gives them: block by block.
+    """
+    blocks = np.empty((len(indices), 3), np.int32)
+    of = np.empty(len(indices), np.int64)
+    count = 0
+    for n in range(len(indices)):
+        same = count > 0
+        for axis in range(3):
+            at = lower[axis] + (indices[n, axis] - lower[axis]) // size * size
+            same = same and blocks[count - 1, axis] == at
+            blocks[count, axis] = at
+        count += not same
+        of[n] = count - 1
+    return blocks[:count], of
