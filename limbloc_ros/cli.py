@@ -46,7 +46,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     Args:
         argv: arguments without the program's name; the process's own if None.
     """
-    arguments = list(sys.argv[1:] if argv is None else argv)
+    arguments = _joined(list(sys.argv[1:] if argv is None else argv))
     name = next((word for word in arguments if not word.startswith("-")), "")
     args = _parser(name).parse_args(arguments)
     if not args.command:
@@ -99,6 +99,17 @@ def _parser(name: str) -> argparse.ArgumentParser:
         )
         module.add_arguments(subparser)
     return parser
+
+
+def _joined(arguments: list[str]) -> list[str]:
+    """`--up -y` as `--up=-y`: argparse would take the axis for another option."""
+    joined: list[str] = []
+    for word in arguments:
+        if word in ("-x", "-y", "-z") and joined and joined[-1] == "--up":
+            joined[-1] += f"={word}"
+        else:
+            joined.append(word)
+    return joined
 
 
 def _interrupt(_number: int, _frame: FrameType | None) -> None:

@@ -7,52 +7,13 @@ from pathlib import Path
 
 import pytest
 import yaml
+from documented import HELPS, PAGES, ROOT, TEXTS, code_lines, commands, examples, parse
 
 from limbloc_ros import cli
-
-ROOT = Path(__file__).parents[1]
-PAGES = sorted(ROOT.glob("docs/**/*.md"))
-TEXTS = [*PAGES, ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
-PROGRAMS = ("limbloc ", "python -m limbloc_ros ")
 
 
 def name_of(path):
     return str(path.relative_to(ROOT))
-
-
-def code_lines(text):
-    """Lines of fenced and indented code, those that end in a backslash joined with the next."""
-    lines, fenced, joined = [], False, ""
-    for line in text.splitlines():
-        if line.strip().startswith("```"):
-            fenced = not fenced
-        elif fenced or line.startswith("    "):
-            joined += line.strip().removesuffix("\\")
-            if not line.rstrip().endswith("\\"):
-                lines.append(joined)
-                joined = ""
-    return lines
-
-
-def commands(text):
-    """Command lines of ours in code, without comments (after `#`, or after a wide gap as in help texts)."""
-    for line in code_lines(text):
-        for program in PROGRAMS:
-            said = re.match(r"limbloc \w+: ", line)  # what it prints, not what is typed
-            if line.startswith(program) and not said and not re.search(r"\b(ACTION|COMMAND)\b", line):
-                yield re.split(r"\s{3,}|\s#", line.removeprefix(program))[0]
-
-
-def parse(command):
-    """Have the real parser read a command line; it raises SystemExit when it cannot."""
-    words = shlex.split(command)
-    name = next((word for word in words if not word.startswith("-")), "")
-    try:
-        return cli._parser(name).parse_args(words)
-    except SystemExit as stopped:
-        if stopped.code == 0 and "--help" in words:
-            return None
-        raise AssertionError(f"limbloc {command}: not a valid command line") from None
 
 
 @pytest.mark.parametrize("path", TEXTS, ids=name_of)
@@ -67,6 +28,64 @@ def test_the_documents_do_have_commands():
     assert set(found) >= set(cli.COMMANDS)
     with pytest.raises(AssertionError, match="not a valid command line"):
         parse("export out/walk --format fbx")
+
+
+def ros2_commands():
+    """Command lines of ROS 2's own tools, in code and between backticks."""
+    for path in TEXTS:
+        text = path.read_text(encoding="utf-8")
+        spans = [
+            " ".join(span.split()) for span in re.findall(r"`(ros2 [^`]+)`", re.sub(r"```.*?```", "", text, flags=re.S))
+        ]
+        for line in [*code_lines(text), *spans]:
+            if line.startswith(("ros2 ", "rviz2 ")):
+                yield name_of(path), line.partition("  #")[0].strip()
+
+
+def executables():
+    nodes = re.search(r"^NODES = \((.+?)\)", SETUP, re.MULTILINE | re.DOTALL)[1]
+    return {"limbloc", *re.findall(r'"(\w+)"', nodes)}
+
+
+SETUP = (ROOT / "setup.py").read_text(encoding="utf-8")
+LAUNCH = ROOT / "launch" / "smart_space.launch.py"
+KNOWN_TOPICS = re.compile(r"/(cam0/(mask/compressed|image_raw)|joints|diagnostics|humans/bodies/p\d/joint_angles)$")
+SERVICES = {"recapture_background": "std_srvs/srv/Trigger", "freeze_background": "std_srvs/srv/SetBool"}
+
+
+@pytest.mark.parametrize(("page", "line"), list(ros2_commands()))
+def test_what_ros2_is_told_is_there(page, line):
+    """ros2, colcon and apt cannot run here: executables, parameters, launch arguments, topics and services exist."""
+    words = shlex.split(line)
+    if words[0] == "rviz2":
+        assert (ROOT / "config" / Path(words[words.index("-d") + 1]).name).is_file()
+    elif words[1] == "run":
+        assert words[2] == "limbloc_ros"
+        assert words[3] in executables()
+        for name in re.findall(r"-p ([\w.]+):=", line):
+            assert f"{words[3]}.{name}" in parameters(), name
+    elif words[1] == "launch":
+        assert words[2:4] == ["limbloc_ros", LAUNCH.name]
+        for name in re.findall(r"(\w+):=", line):
+            assert f'"{name}":' in LAUNCH.read_text(encoding="utf-8"), name
+    elif words[1] == "topic":
+        assert words[2] in ("hz", "delay", "echo", "list")
+        assert words[2] == "list" or KNOWN_TOPICS.match(words[3]), words[3]
+    elif words[1] == "service":
+        assert SERVICES[words[3].rpartition("/")[2]] == words[4]
+        assert re.fullmatch(r"/segmentation_cam\d/\w+", words[3])
+        if len(words) > 5 and not words[5].startswith("-"):
+            assert set(yaml.safe_load(words[5])) == {"data"}
+    elif words[1] == "security":
+        assert words[2] in ("create_keystore", "generate_artifacts")
+    else:
+        assert words[1] in ("param", "bag"), line
+
+
+def test_optional_parts_that_are_named_exist():
+    for path in TEXTS:
+        for extra in re.findall(r"limbloc_ros\[(\w+)\]", path.read_text(encoding="utf-8")):
+            assert f'"{extra}": [' in SETUP, f"{name_of(path)}: {extra}"
 
 
 def parameters():
@@ -90,14 +109,11 @@ def test_parameters_that_are_named_exist(path):
             assert name in known, f"{name_of(path)}: {name}"
 
 
-@pytest.mark.parametrize("command", cli.COMMANDS)
-def test_the_examples_of_every_help_parse(command, capsys):
-    with pytest.raises(SystemExit):
-        cli.main([command, "--help"])
-    text = capsys.readouterr().out
-    examples = list(commands("\n".join(f"    {line}" for line in text.partition("examples:")[2].splitlines())))
-    assert examples, "a help has examples"
-    for example in examples:
+@pytest.mark.parametrize("words", HELPS)
+def test_the_examples_of_every_help_parse(words):
+    found = examples(words)
+    assert found, "a help has examples"
+    for example in found:
         parse(example)
 
 

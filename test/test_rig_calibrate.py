@@ -2,12 +2,14 @@
 """Calibration against known truth: derivatives, projected corners with noise, rendered images, and what is refused."""
 
 import re
+import shlex
 from collections import Counter
 
 import cv2
 import numpy as np
 import pytest
 import rig_boards
+from documented import ROOT, TEXTS, commands, examples
 from scipy.spatial.transform import Rotation
 
 from limbloc_ros import cli
@@ -168,11 +170,14 @@ def test_corners_of_rendered_boards(text):
         assert np.sqrt(((places - true) ** 2).sum(axis=1).mean()) < 0.2
 
 
+SMALL_BOARD = "charuco:7x5:0.15:0.11"
+
+
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory):
     """Pictures of a board in a room: near each camera, walked about, on the floor."""
     folder = tmp_path_factory.mktemp("board")
-    board = parse_board("charuco:7x5:0.15:0.11")
+    board = parse_board(SMALL_BOARD)
     rng = np.random.default_rng(7)
     ring = default_rig(8, 960, 720)
     rig = Rig(ring.cameras[:3], ring.volume_min, ring.volume_max)
@@ -188,7 +193,7 @@ def recording(tmp_path_factory):
 def test_from_images_to_a_rig_file_and_a_report(recording, tmp_path, capsys):
     folder, truth = recording
     out = tmp_path / "rig.yaml"
-    code = cli.main(["rig", "calibrate", str(folder), "--board", "charuco:7x5:0.15:0.11", "--out", str(out)])
+    code = cli.main(["rig", "calibrate", str(folder), "--board", SMALL_BOARD, "--out", str(out)])
     said = capsys.readouterr().out
     assert code == 0, said
     place, turn = errors(truth.cameras, load_rig(out).cameras)
@@ -206,26 +211,37 @@ def test_from_images_to_a_rig_file_and_a_report(recording, tmp_path, capsys):
 
 def test_lenses_alone(recording, tmp_path, capsys):
     folder, truth = recording
-    code = cli.main(
-        [
-            *[
-                "rig",
-                "calibrate",
-                "--board",
-                "charuco:7x5:0.15:0.11",
-                "--intrinsics-only",
-                "--cameras",
-                "cam0",
-                "--out",
-            ],
-            str(tmp_path),
-            str(folder),
-        ]
-    )
-    assert code == 0
+    command = ["rig", "calibrate", str(folder), "--board", SMALL_BOARD, "--intrinsics-only", "--out", str(tmp_path)]
+    assert cli.main([*command, "--cameras", "cam0"]) == 0
     assert "cam0: " in capsys.readouterr().out
     camera = FORMATS["ros"].read([tmp_path / "cam0.yaml"]).cameras[0]
     assert abs(camera.K[0, 0] / truth.cameras[0].K[0, 0] - 1) < 0.02
+
+
+DOCUMENTED = [
+    *(command for path in TEXTS for command in commands(path.read_text(encoding="utf-8"))),
+    *(command for words in ("rig", "rig calibrate") for command in examples(words)),
+]
+#: Pictures to lenses and rig are what the two tests above do; of a bag it is done with `--every`.
+RUN_ABOVE = ({"--board", "--out"}, {"--board", "--intrinsics-only", "--out"})
+
+
+def test_the_documented_command_lines_run(recording, tmp_path, monkeypatch):
+    """On this recording in place of theirs: its board, folders, floor frames."""
+    folder, rig = recording
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(ROOT / "tools"))
+    import footage_to_bag
+
+    footage_to_bag.write_bag(folder, rig, tmp_path / "bag", encoding="jpeg")
+    ours = {"bags/board": "bag", "310": "36", "311": "37", "312": "38", "5": "2"}
+    ours |= dict.fromkeys(("board/", "recording/", "lenses/"), str(folder))
+    lines = {line for line in DOCUMENTED if line.startswith("rig calibrate ")}
+    assert len(lines) >= 5
+    for line in sorted(lines):
+        words = [ours.get(word, re.sub(r"^(charuco|checkerboard):.*", SMALL_BOARD, word)) for word in shlex.split(line)]
+        if {word for word in words if word.startswith("--")} not in RUN_ABOVE:
+            assert cli.main(words) == 0, line
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ EPILOG = """\
 examples:
   limbloc rig import Calib.qca.txt --out rig.yaml       from Qualisys, Kalibr, multical, Pose2Sim, ROS, ...
   limbloc rig calibrate board/ --board charuco:7x5:0.08:0.06 --out rig.yaml
-  limbloc rig check videos/ --rig rig.yaml              is it right? which camera is not?
+  limbloc rig check bags/walk --rig rig.yaml            is it right? which camera is not?
   limbloc rig plan --cameras 8 --room 5x5x2.8           where to hang them, and what to expect
   limbloc rig ACTION --help                             options and examples of each
 """

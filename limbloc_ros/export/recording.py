@@ -12,7 +12,7 @@ from limbloc_ros.core.camera import Rig
 from limbloc_ros.core.config import BackgroundConfig, FitConfig, HullConfig, SyncConfig, from_mapping
 from limbloc_ros.core.errors import InputError
 from limbloc_ros.recordings.offline import OfflineConfig
-from limbloc_ros.recordings.open_source import open_source
+from limbloc_ros.recordings.open_source import is_bag, open_source
 from limbloc_ros.recordings.results import Run
 from limbloc_ros.recordings.sources import MaskSet, Source
 from limbloc_ros.rig.rig_file import load_rig
@@ -56,15 +56,16 @@ def open_recording(run: Run, folder: Path, recording: Path | None = None, backgr
         raise InputError(
             f"the run's recording {path} is not there; say where it is now with --recording (bag, folder or case)"
         )
-    kind = run.about.get("kind", "")
-    folder_kind = kind in ("images", "silhouettes")
+    kind, now_a_bag = run.about.get("kind", ""), path.exists() and is_bag(path)
+    if background is None and now_a_bag == (kind == "bag"):  # a bag of masks may stand for the videos it was made of
+        background = run.about.get("background_from")
     return open_source(
         path,
         rig_of(folder),
         config_of(run),
-        background=background or run.about.get("background_from"),
-        masks=kind == "silhouettes",
-        fps=float(run.about["fps"]) if folder_kind and "fps" in run.about else None,
+        background=background,
+        masks=kind == "silhouettes" and not now_a_bag,
+        fps=float(run.about["fps"]) if "fps" in run.about and not now_a_bag else None,
     )
 
 

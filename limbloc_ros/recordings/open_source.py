@@ -71,7 +71,7 @@ def _open(
     pictures: dict[str, Pixels] = {}
     if background is not None and background != ESTIMATE:
         pictures = background_pictures(Path(background), rig)
-    if _is_bag(path):
+    if is_bag(path):
         if masks or fps or background == ESTIMATE:
             raise InputError(
                 f"{path} is a bag, which says itself what it holds: leave --masks, --fps and estimate away"
@@ -108,7 +108,8 @@ def background_pictures(folder: Path, rig: Rig) -> dict[str, Pixels]:
     return pictures
 
 
-def _is_bag(path: Path) -> bool:
+def is_bag(path: Path) -> bool:
+    """Whether a file or folder is a bag."""
     if path.is_file():
         return path.suffix in (*SUFFIXES, ".bag")
     return (path / "metadata.yaml").is_file() or any(child.suffix in SUFFIXES for child in path.iterdir())
