@@ -108,7 +108,7 @@ def test_a_jump_is_followed_by_the_centre_of_the_surface():
 # an arm that has slipped
 
 
-def test_an_arm_that_slipped_into_the_trunk_is_found_again():
+def test_an_arm_that_slipped_into_the_trunk_is_found_again(monkeypatch):
     start = follow(Tracker(seed=0), 20)
     placed = place(start.state)
     shoulder, elbow, hand = (placed.origins[BONE[f"{name}_L"]] for name in ARM.bones)
@@ -121,14 +121,30 @@ def test_an_arm_that_slipped_into_the_trunk_is_found_again():
     end = towards(middle, belly, np.linalg.norm(hand - elbow))
     slipped = with_limb(start.state, placed, ARM, "L", np.concatenate([middle, end, [0.0]]))
     wrist = []
-    for frame_number in (Tracker.PATIENCE - 1, 1):  # the next frame is one where arms are checked, and not
+    for checks in (True, False):
+        if not checks:
+            monkeypatch.setattr(Tracker, "_limbs_are_due", lambda self, cost: False)
         follower = Tracker(seed=0)
         follow(follower, 20)
-        follower._last, follower._frame = slipped, frame_number
-        follower._last_scratch = frame_number  # no start anew
+        follower._last = slipped
         wrist.append(errors(follow(follower, 20), 20)[JOINT["wrist_L"]])
     assert wrist[0] < 0.06
     assert wrist[1] > 0.15
+
+
+def test_a_limb_that_moves_fast_is_not_lost():
+    """Every third frame of a waving person: the hand moves by half a forearm from one to the next."""
+    waving = load_case(BENCHMARK / "public/seq_wave")
+    carver, follower = Carver(waving.rig), Tracker(seed=0)
+    truth = np.stack([waving.truth[joint] for joint in ("wrist_L", "wrist_R")], axis=1)
+    jumps, off = [], []
+    for frame in range(0, 24, 3):
+        hull = carver.carve(waving.masks(frame))
+        joints = place(follower.follow(hull, extract_surface(hull)).state).joints
+        off.append(np.linalg.norm(joints[[JOINT["wrist_L"], JOINT["wrist_R"]]] - truth[frame], axis=1).max())
+        jumps.append(np.linalg.norm(truth[frame] - truth[max(frame - 3, 0)], axis=1).max())
+    assert max(jumps) > 0.15
+    assert max(off) < 0.10
 
 
 # when a fit is doubted
@@ -139,12 +155,13 @@ class Stand:
 
     def __init__(self, monkeypatch):
         self.scratch_cost, self.costs = 1e-4, {}
-        self.searched, self.refined, self.checked = [], [], []
+        self.searched, self.refined, self.checked, self.guessed = [], [], [], []
         self.frame = 0
         monkeypatch.setattr(tracker, "fit_from_scratch", self.search)
         monkeypatch.setattr(tracker, "refine", self.refine)
         monkeypatch.setattr(tracker, "gather_evidence", lambda *args: SimpleNamespace(args=args))
-        monkeypatch.setattr(Tracker, "_check_arms", self.check)
+        monkeypatch.setattr(Tracker, "_check_limbs", self.check)
+        monkeypatch.setattr(tracker.energy, "system", self.system)
 
     def search(self, hull, surface, seed, weights, searches):
         self.searched.append((self.frame, seed, weights, searches))
@@ -160,7 +177,11 @@ class Stand:
         cost = self.costs.get(self.frame, 1e-4)
         return SimpleNamespace(state=FigureState.standing(state.root), system=SimpleNamespace(cost=cost))
 
-    def check(self, result, hull, surface, evidence):
+    def system(self, state, evidence, weights):
+        self.guessed.append((self.frame, state))
+        return SimpleNamespace(cost=self.costs.get(self.frame, 1e-4))
+
+    def check(self, result, hull, surface, evidence, size):
         self.checked.append(self.frame)
         return result
 
@@ -183,12 +204,19 @@ def stand(monkeypatch):
     return Stand(monkeypatch)
 
 
-def test_calm_frames_are_followed_and_arms_checked_now_and_then(stand):
+def test_calm_frames_are_followed_and_limbs_checked_now_and_then(stand):
     stand.run(Tracker(seed=0), 20)
     assert stand.search_frames == [1]
     assert [frame for frame, *_ in stand.refined] == list(range(2, 21))
     assert stand.checked == [8, 16]
     assert Tracker.PATIENCE == 8
+
+
+def test_limbs_are_checked_at_once_when_the_cost_rises_and_ever_less_often_in_vain(stand):
+    stand.costs = {frame: 1e-4 * 1.4 ** (frame - 2) for frame in range(3, 10)}
+    stand.run(Tracker(seed=0), 9)
+    assert stand.checked == [3, 5, 9]
+    assert stand.search_frames == [1, 9]  # which takes longer and waits longer
 
 
 def test_what_is_searched_can_be_said(stand):

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from limbloc_ros.core import lm
+from limbloc_ros.core import energy, lm
 from limbloc_ros.core.energy import Evidence, Weights
 from limbloc_ros.core.engine_robust import (
     QUICK,
@@ -20,14 +20,20 @@ from limbloc_ros.core.engine_robust import (
     gather_evidence,
     make_scene,
     refine,
-    with_arms,
+    with_one_limb,
 )
-from limbloc_ros.core.figure import FigureState
+from limbloc_ros.core.figure import BONE, FigureState
 from limbloc_ros.core.hull import Hull
-from limbloc_ros.core.search import Medial
+from limbloc_ros.core.search import ARM, LEG, Medial
 from limbloc_ros.core.surface import Surface
 
 Array = NDArray[np.float64]
+
+
+#: Bones whose turn goes on from frame to frame; how hands and feet turn is seen too badly to go by.
+SWINGING = np.array(
+    [BONE["pelvis"]] + [BONE[f"{name}_{side}"] for name in ("upper_arm", "forearm", "thigh", "shin") for side in "LR"]
+)
 
 
 class Tracker:
@@ -36,7 +42,7 @@ class Tracker:
     #: A cost this much above the usual one, or above this many m^2, is no longer believed ...
     DOUBT, DOUBTFUL_COST = 1.35, 4.5e-4
     #: ... but starting anew, which takes as long as many followed frames, is tried only every so many frames: in a
-    #: live room a slow fit makes the next step longer. Arms are checked as often. Each time that starting anew finds
+    #: live room a slow fit makes the next step longer. Limbs are checked as often. Each time that starting anew finds
     #: nothing better, the wait doubles, up to this: some hulls are just bad.
     PATIENCE, LONGEST_WAIT = 8, 32
     #: What is searched when starting anew: less than for a frame alone, for the next frames can mend it.
@@ -47,16 +53,17 @@ class Tracker:
             rounds=1,
         ),
     )  # fmt: skip
-    #: Other pairs of arms that are tried when arms are checked.
-    ARM_PAIRS = 2
+    #: Limbs are checked at once when the cost is so much above the usual one (in vain, the wait doubles); other places
+    #: that are tried for each; how much lower the energy must be there.
+    LIMB_DOUBT, ARM_PLACES, LEG_PLACES, BETTER = 1.25, 1, 1, 0.97
     #: The figure is carried along with the firm weights of the search, which lead from further off; so many more steps
     #: with the final ones put its joints in their places.
-    FINAL_STEPS = 4
+    FINAL_STEPS = 6
     #: People do not change their size, and one hull says little of it: what a squared deviation from the mean shape so
     #: far costs (m^2) per frame in that mean, and how many frames count.
-    SIZE_WEIGHT, REMEMBERED = 2e-4, 20
+    SIZE_WEIGHT, REMEMBERED = 1e-4, 20
     #: Surface points that a figure is carried along on.
-    POINTS = 450
+    POINTS = 700
 
     def __init__(self, seed: int, weights: Weights | None = None, searches: Sequence[Effort] = SEARCHES) -> None:
         self._seed, self._weights, self._searches = seed, weights or Weights(), searches
@@ -66,6 +73,8 @@ class Tracker:
     def reset(self) -> None:
         """Forget the last frame."""
         self._last: FigureState | None = None
+        self._before: FigureState | None = None
+        self._next_check, self._next_doubt, self._doubt_wait = self.PATIENCE, 0, 1
         self._usual_cost = 0.0
         self._frame = 0
         self._last_scratch = -self.PATIENCE
@@ -81,14 +90,20 @@ class Tracker:
         moved, self._centre = centre - self._centre, centre
         if self._last is not None:
             evidence = gather_evidence(hull, surface, self.POINTS, np.random.default_rng(self._seed))
-            carried = FigureState(self._last.root + moved, self._last.rotations, self._last.shape)
-            result = refine(carried, evidence, self._firm, 8 if np.abs(moved).max() < 0.1 else 20)
-            if self._frame % self.PATIENCE == 0:
-                result = self._check_arms(result, hull, surface, evidence)
+            guesses = self._guesses(self._last, moved)
+            costs = [energy.system(guess, evidence, self._firm).cost for guess in guesses]
+            start = guesses[int(np.argmin(costs))]
             size = KnownSize(self._size, self.SIZE_WEIGHT * min(self._sized, self.REMEMBERED))
+            result = refine(start, evidence, self._firm, 8 if np.abs(moved).max() < 0.1 else 20, size)
+            if self._limbs_are_due(result.system.cost):
+                checked = self._check_limbs(result, hull, surface, evidence, size)
+                self._doubt_wait = 1 if checked is not result else min(2 * self._doubt_wait, self.PATIENCE)
+                self._next_doubt, self._next_check = self._frame + self._doubt_wait, self._frame + self.PATIENCE
+                result = checked
+            judged = energy.system(result.state, evidence, self._firm).cost
             final = refine(result.state, evidence, self._weights, self.FINAL_STEPS, size)
             self._remember(final.state.shape)
-            fit = Fit(final.state, final.system, judged=result.system.cost)
+            fit = Fit(final.state, final.system, judged=judged)
         if fit is None or self._doubts(fit.judged):
             self._last_scratch = self._frame
             scratch = fit_from_scratch(hull, surface, self._seed, self._weights, self._searches)
@@ -98,13 +113,24 @@ class Tracker:
             else:
                 self._wait = min(2 * self._wait, self.LONGEST_WAIT)
         if fit is None:
-            self._last = None
+            self._before = self._last = None
             return None
         # the usual cost follows slowly, so one odd frame is judged by the calm ones before it
         fresh = self._last is None or self._usual_cost == 0.0
         self._usual_cost = fit.judged if fresh else 0.9 * self._usual_cost + 0.1 * fit.judged
-        self._last = fit.state
+        self._before, self._last = self._last, fit.state
         return fit
+
+    def _guesses(self, last: FigureState, moved: Array) -> list[FigureState]:
+        """Where the figure may be now: carried along as it is, and turning on as it turned between the last frames."""
+        root = last.root + moved
+        guesses = [FigureState(root, last.rotations, last.shape)]
+        if self._before is not None:
+            rotations = last.rotations.copy()
+            turn = self._before.rotations[SWINGING].transpose(0, 2, 1) @ last.rotations[SWINGING]
+            rotations[SWINGING] = last.rotations[SWINGING] @ turn
+            guesses.append(FigureState(root, rotations, last.shape))
+        return guesses
 
     def _remember(self, shape: Array) -> None:
         """The mean shape of the last frames."""
@@ -115,15 +141,21 @@ class Tracker:
         waited = self._frame - self._last_scratch >= self._wait
         return waited and (cost > self.DOUBT * self._usual_cost or cost > self.DOUBTFUL_COST)
 
-    def _check_arms(
-        self, result: lm.LmResult[FigureState], hull: Hull, surface: Surface, evidence: Evidence
+    def _limbs_are_due(self, cost: float) -> bool:
+        if self._frame >= self._next_check:
+            return True
+        return self._frame >= self._next_doubt and cost > self.LIMB_DOUBT * self._usual_cost
+
+    def _check_limbs(
+        self, result: lm.LmResult[FigureState], hull: Hull, surface: Surface, evidence: Evidence, size: KnownSize
     ) -> lm.LmResult[FigureState]:
-        """An arm that has slipped into the trunk stays there, for its flesh is explained: look for it elsewhere."""
+        """A limb that moved too fast, or has slipped into the trunk, stays behind: look for each elsewhere."""
         scene = make_scene(hull, Medial.of(hull), surface, self._seed, self._weights, QUICK)
-        best = result
-        for state in with_arms(result.state, scene, self.ARM_PAIRS, QUICK.candidates):
-            settled = refine(state, scene.quick, scene.lenient, 5).state
-            other = refine(settled, evidence, self._firm, 8)
-            if other.system.cost < 0.94 * best.system.cost:
-                best = other
-        return best
+        for kind, places in ((ARM, self.ARM_PLACES), (LEG, self.LEG_PLACES)):
+            for side in "LR":
+                for state in with_one_limb(result.state, scene, kind, side, places, QUICK.candidates):
+                    settled = refine(state, scene.quick, scene.lenient, 5, size).state
+                    other = refine(settled, evidence, self._firm, 8, size)
+                    if other.system.cost < self.BETTER * result.system.cost:
+                        result = other
+        return result
