@@ -118,6 +118,7 @@ class Supervisor:
     @property
     def pids(self) -> dict[str, int]:
         """Process ids of what runs now, by name."""
+        self._meet_started(time.monotonic())
         return {c.plan.name: c.process.pid for c in self._children if c.process and c.process.poll() is None}
 
     def start(self) -> None:
