@@ -213,19 +213,22 @@ def darken_floor(
 ) -> None:
     """Multiply floor pixels by `light` [h, w] (1 = no shadow), bilinear; floor [H, W, 2] are the pixels' cells."""
     h, w = light.shape
+    one, zero = np.float32(1), np.float32(0)
+    left, top, width, height = np.float32(cell_x0), np.float32(cell_y0), np.float32(w - 1), np.float32(h - 1)
     for y in range(y0, y1):
         for x in range(x0, x1):
-            gx, gy = floor[y, x, 0] - cell_x0, floor[y, x, 1] - cell_y0
-            if gx < 0 or gy < 0 or gx >= w - 1 or gy >= h - 1:
+            gx, gy = floor[y, x, 0] - left, floor[y, x, 1] - top
+            if not (gx >= zero and gy >= zero and gx < width and gy < height):
                 continue
-            i, j = int(gy), int(gx)
-            fy, fx = gy - i, gx - j
-            value = (light[i, j] * (1 - fx) + light[i, j + 1] * fx) * (1 - fy) + (
-                light[i + 1, j] * (1 - fx) + light[i + 1, j + 1] * fx
-            ) * fy
-            if value < 0.999:
+            i, j = np.int32(gy), np.int32(gx)
+            a, b, c, d = light[i, j], light[i, j + 1], light[i + 1, j], light[i + 1, j + 1]
+            if a == one and b == one and c == one and d == one:
+                continue
+            fy, fx = gy - np.float32(i), gx - np.float32(j)
+            value = (a * (one - fx) + b * fx) * (one - fy) + (c * (one - fx) + d * fx) * fy
+            if value < np.float32(0.999):
                 for k in range(3):
-                    image[y, x, k] = int(image[y, x, k] * value + 0.5)
+                    image[y, x, k] = np.uint8(np.float32(image[y, x, k]) * value + np.float32(0.5))
 
 
 @njit(cache=True, error_model="numpy")

@@ -27,6 +27,8 @@ Mask = NDArray[np.uint8]
 _LIGHT = np.array([0.35, -0.25, 0.9]) / np.linalg.norm([0.35, -0.25, 0.9])
 _CELL_M = 0.02
 _NEAR_M = 0.15
+#: The floor's light below which `darken_floor` changes a pixel.
+_DARK = 0.999
 # Points on the rim of the unit square, densely, because the image of a straight edge is not straight.
 _RIM = np.concatenate([[(a, 0), (a, 1), (0, a), (1, a)] for a in np.linspace(0, 1, 9)])
 
@@ -267,7 +269,12 @@ class SimulatedRoom:
         shadow = cv2.blur(cv2.blur(shadow, (5, 5)), (5, 5))
         contact = cv2.blur(cv2.blur(contact, (9, 9)), (9, 9))
         light = (1 - np.float32(0.28) * shadow) * (1 - np.float32(0.4) * contact)
-        return np.ascontiguousarray(light), (int(low[0]), int(low[1]))
+        # Only where it is darker, and one cell around: all cameras look at every pixel of this piece of floor.
+        dark = np.argwhere(light < _DARK)
+        if not len(dark):
+            return light[:1, :1], (int(low[0]), int(low[1]))
+        (y0, x0), (y1, x1) = np.maximum(dark.min(axis=0) - 1, 0), dark.max(axis=0) + 2
+        return np.ascontiguousarray(light[y0:y1, x0:x1]), (int(low[0] + x0), int(low[1] + y0))
 
     def _draw_shadow(self, view: _View, instant: _Instant, image: Image) -> None:
         h, w = instant.floor_light.shape
