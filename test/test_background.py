@@ -160,6 +160,16 @@ class TestKernels:
         assert np.abs(sharpness[:, 1::4] - kernels.SHARPNESS_SCALE / sigma).max() < 0.6
         assert not level[:, 0::4].any()
 
+    def test_images_are_taken_into_mean_and_variance(self):
+        images = np.random.default_rng(4).integers(0, 256, (6, 3, 20, 33), dtype=np.uint8)
+        gain = np.array([0.8, 1.0, 1.1], dtype=np.float32)
+        mean, squares = images[0].astype(np.float32), np.zeros(images[0].shape, dtype=np.float32)
+        for count, image in enumerate(images[1:], start=2):
+            kernels.add_to_mean(image, gain, count, mean, squares)
+        brought = np.concatenate([images[:1].astype(float), images[1:] / gain[:, None, None]])
+        np.testing.assert_allclose(mean, brought.mean(axis=0), rtol=1e-5, atol=1e-3)
+        np.testing.assert_allclose(squares / len(images), brought.var(axis=0), rtol=1e-4, atol=1e-2)
+
     @given(st.tuples(*[st.floats(0.4, 1.6)] * 3), st.integers(0, 5))
     @settings(max_examples=30, deadline=None)
     def test_light_gain_ignores_a_person(self, gain, seed):

@@ -161,6 +161,28 @@ def learn(
             fix(m, v, floor_variance, weight, level[c, y], sharpness[c, y])
 
 
+@njit(cache=True, fastmath=_VECTOR, error_model="numpy")
+def add_to_mean(image: Bytes, gain: Floats, count: int, mean: Floats, squares: Floats) -> None:
+    """Take one more image into a running mean and sum of squared deviations, in place (Welford 1962).
+
+    Args:
+        image, gain: as in `measure`; the image is brought to the mean's light.
+        count: images with this one.
+        mean, squares: [3, H, W] grey levels and their square.
+    """
+    share = np.float32(1) / np.float32(count)
+    for c in range(image.shape[0]):
+        inverse = np.float32(1) / gain[c]
+        for y in range(image.shape[1]):
+            pixel, m, s = image[c, y], mean[c, y], squares[c, y]
+            for x in range(pixel.size):
+                now = np.float32(pixel[x]) * inverse
+                before = now - m[x]
+                after = m[x] + before * share
+                s[x] += before * (now - after)
+                m[x] = after
+
+
 @njit(cache=True)
 def light_gain(image: Bytes, level: Words, busy: Bytes, last: Floats, stride: int) -> Floats:
     """Brightness of the light per channel relative to the model: a median ratio, then a trimmed ratio of sums.

@@ -28,7 +28,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from limbloc_ros.core._background_kernels import CHANGE_SCALE, fix_all, learn, light_gain, measure
+from limbloc_ros.core._background_kernels import CHANGE_SCALE, add_to_mean, fix_all, learn, light_gain, measure
 from limbloc_ros.core.background_estimate import BackgroundEstimate, estimate_background, fixed_levels, noise_variance
 from limbloc_ros.core.config import BackgroundConfig, validated
 from limbloc_ros.core.errors import InputError
@@ -63,6 +63,7 @@ RESTLESS_SIGMA, UNREST = 10.0, 0.005
 """A pixel that varied more than this (grey levels) while the background was learned was not empty; and the share of
 such pixels from which on somebody must have moved. Empty rooms had none, rooms with somebody who walks 3 to 20 %."""
 
+_ONES = np.ones(3, dtype=np.float32)
 _RIM = np.ones((5, 5), dtype=np.uint8)
 
 
@@ -88,7 +89,7 @@ class BackgroundModel:
         self._variance = self._mean.copy()
         self._level = np.zeros(self._mean.shape, dtype=np.uint16)
         self._sharpness = self._level.copy()
-        self._gain = np.ones(3, dtype=np.float32)
+        self._gain = _ONES
         self._busy = np.zeros((0, 0), dtype=np.uint8)
         self._changed = self._busy
         self._share, self._doubts = 0.0, 0
@@ -339,12 +340,11 @@ class BackgroundModel:
         if self._learned == 0:
             self._allocate(planes)
             return
-        gain = light_gain(planes, fixed_levels(self._mean), self._busy, np.ones(3, dtype=np.float32), self._stride())
+        some = (slice(None), *2 * (slice(self._stride() // 2, None, self._stride()),))
+        now, mean = np.ascontiguousarray(planes[some]), fixed_levels(self._mean[some])
+        gain = light_gain(now, mean, np.zeros(now.shape[1:], dtype=np.uint8), _ONES, 1)
         self._learned += 1
-        now = planes.astype(np.float32) / gain[:, None, None]
-        before = now - self._mean
-        self._mean += before / np.float32(self._learned)
-        self._variance += before * (now - self._mean)
+        add_to_mean(planes, gain, self._learned, self._mean, self._variance)
 
     def _finish_learning(self) -> None:
         self._ready = True
@@ -451,7 +451,7 @@ class BackgroundModel:
         self._keep(self._mean, self._variance)
         brighter = np.clip(mean / np.maximum(self._mean, 1.0), 1.0, 3.0)
         self._variance *= brighter * brighter  # noise grows with the light, if it does
-        self._mean, self._gain = mean, np.ones(3, dtype=np.float32)
+        self._mean, self._gain = mean, _ONES
         self._relit += 1
         self._fix_model()
         return True
@@ -467,7 +467,7 @@ class BackgroundModel:
             self._mean, self._variance = former[0], former[1].astype(np.float32)
             self._fix_model()
             nobody = np.zeros(self._mean.shape[1:], dtype=np.uint8)
-            self._gain = light_gain(planes, self._level, nobody, np.ones(3, dtype=np.float32), self._stride())
+            self._gain = light_gain(planes, self._level, nobody, _ONES, self._stride())
             if self._far(self._measure(planes)[0])[1] > most:
                 continue
             del self._former[n]
