@@ -29,7 +29,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
 
 from limbloc_ros.core import figure
 from limbloc_ros.core.config import FitConfig
@@ -309,8 +308,7 @@ class People:
         # What is not known to be a person stands back.
         first += np.array([[0.0 if track.number else 0.05] for track in tracks])
         table = np.concatenate([first] + [again] * (len(tracks) - 1), axis=1)
-        rows, columns = linear_sum_assignment(table)
-        chosen = [(int(r), int(c) % len(parts)) for r, c in zip(rows, columns, strict=True) if table[r, c] < never]
+        chosen = [(r, c % len(parts)) for r, c in _cheapest_pairs(table) if table[r, c] < never]
         return [(tracks[r], n) for r, n in self._not_crowded(chosen, parts, cost)]
 
     def _not_crowded(self, chosen: list[tuple[int, int]], parts: Sequence[Part], cost: Array) -> list[tuple[int, int]]:
@@ -414,3 +412,12 @@ def _track(values: Mapping[str, Any], estimator: PoseEstimator) -> _Track:
     fields["angles"] = ContinuousAngles()
     fields["angles"].restore(*values["angles"])
     return _Track(estimator=estimator, **fields)
+
+
+def _cheapest_pairs(table: Array) -> list[tuple[int, int]]:
+    """Each row's column, none twice, so that the sum is least; there are as many columns as rows, or more."""
+    if len(table) == 1:
+        return [(0, int(table[0].argmin()))]
+    from scipy.optimize import linear_sum_assignment  # a tenth of a second, for which one person need not wait
+
+    return [(int(r), int(c)) for r, c in zip(*linear_sum_assignment(table), strict=True)]
