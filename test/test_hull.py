@@ -223,16 +223,17 @@ def test_changed_masks_are_evaluated_again_as_if_from_scratch():
             continue
         changes = {}
         for c in rng.choice(len(before.names), 2, replace=False):
-            mask = before.masks[c].copy()
+            mask = before.whole_mask(c)
             cv2.circle(mask, tuple(int(n) for n in rng.uniform(0, 1, 2) * mask.shape[::-1]), rng.integers(2, 15), 1, -1)
-            changes[int(c)] = mask
+            changes[int(c)] = mask, 0, 0
         after = before.with_masks(changes)
         voxels = evaluate(before, 0.12)
         again = evaluate_again(voxels, before, after, 0.12)
         scratch = evaluate(after, 0.12)
         for mine, theirs in zip(in_order(again), in_order(scratch), strict=True):
             np.testing.assert_array_equal(mine, theirs)
-        assert_exact(rig, dict(zip(after.names, after.masks, strict=True)), 0.16, 0.12)
+        whole = {name: after.whole_mask(c) for c, name in enumerate(after.names)}
+        assert_exact(rig, whole, 0.16, 0.12)
 
 
 def in_order(voxels):

@@ -154,7 +154,7 @@ def test_pieces_end_where_nothing_nearer_than_the_band_can_be_seen(x):
     margin = min(95 - x0, 60 - y0, x0 + width - 105, y0 + height - 90)
     assert margin * nearest / 100.0 >= 0.06
     assert margin <= 100 * 0.06 / (0.5 * nearest) + 4
-    exact = exact_distance(silhouettes.masks[0])[y0:, x0:][:height, :width]
+    exact = exact_distance(silhouettes.whole_mask(0))[y0:, x0:][:height, :width]
     np.testing.assert_array_equal(silhouettes.piece(0), np.minimum(exact, silhouettes.margins[0] - 0.5))
 
 
@@ -164,11 +164,11 @@ def test_a_camera_in_the_volume_keeps_its_whole_image():
 
 def test_masks_that_grow_get_larger_pieces():
     silhouettes = one_mask(rig_of((-3.0, 0.0, 1.0)))
-    grown = silhouettes.masks[0].copy()
+    grown = silhouettes.whole_mask(0)
     grown[20:60, 98:101] = 1
-    after = silhouettes.with_masks({0: grown})
+    after = silhouettes.with_masks({0: (grown, 0, 0)})
     x0, y0, width, height, _ = after.boxes[0]
-    assert y0 < 20 and after.masks[0] is grown
+    assert y0 < 20 and (after.whole_mask(0) == grown).all()
     exact = exact_distance(grown)[y0:, x0:][:height, :width]
     np.testing.assert_array_equal(after.piece(0), np.minimum(exact, after.margins[0] - 0.5))
     changes = after.changes_since(silhouettes)
@@ -177,7 +177,7 @@ def test_masks_that_grow_get_larger_pieces():
     assert top == y0 or top >= 20 - after.margins[0]
     assert left < 98 < 101 < left + columns and 60 < top + rows < 90
     counted = np.diff(np.diff(changes.sums.reshape(rows + 1, columns + 1), axis=0), axis=1)
-    before = np.full(after.masks[0].shape, np.inf)
+    before = np.full(grown.shape, np.inf)
     x, y, width, height, _ = silhouettes.boxes[0]
     before[y : y + height, x : x + width] = silhouettes.piece(0)
     nearer = (exact_distance(grown) < before) & (exact_distance(grown) < after.margins[0] - 0.5)

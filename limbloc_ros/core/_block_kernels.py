@@ -53,7 +53,7 @@ def counts_any(frames: Any, sums: Any, c: int, u: float, v: float, r: float) -> 
 def near_blocks(
     blocks: Any, size: int, voxel: float, cams: Any, frames: Any, sums: Any, band: float, min_seen: int
 ) -> Any:
-    """Those of the blocks (cubes of `size` voxels) that may hold a wanted voxel.
+    """Which blocks (cubes of `size` voxels) may hold a wanted voxel, bool [B].
 
     Wanted is a voxel whose largest camera distance is below `band` or whose second largest is negative. The 2D distance
     changes by at most one pixel a pixel, so nothing is lost. The cameras are asked one after the other, each only
@@ -82,7 +82,9 @@ def near_blocks(
             left[kept] = left[n]
             kept += 1
         count = kept
-    return blocks[left[:count]]
+    out = np.zeros(len(blocks), np.bool_)
+    out[left[:count]] = True
+    return out
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
@@ -117,8 +119,8 @@ def nearest_depths(blocks: Any, size: int, voxel: float, cams: Any) -> Any:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
-def blocks_in_changes(blocks: Any, size: int, voxel: float, cams: Any, frames: Any, sums: Any) -> Any:
-    """Which blocks have a voxel that may read a changed pixel, bool [B]; `frames` and `sums` count what changed."""
+def blocks_beside(blocks: Any, size: int, voxel: float, cams: Any, frames: Any, sums: Any, distance: float) -> Any:
+    """Which blocks have a voxel that may lie within `distance` (m) of a counted pixel in some camera, bool [B]."""
     centres, radius = block_balls(blocks, size, voxel)
     views = np.empty((5, len(blocks)))
     out = np.zeros(len(blocks), np.bool_)
@@ -127,8 +129,11 @@ def blocks_in_changes(blocks: Any, size: int, voxel: float, cams: Any, frames: A
             continue
         view_of_balls(cams, c, centres, radius, len(blocks), views)
         for n in range(len(blocks)):
-            u, v, reach, how = views[0, n], views[1, n], views[3, n] + 1.0, views[4, n]  # 1 px more: bilinear reading
-            out[n] |= how == UNKNOWN or (how != UNSEEN and counts_any(frames, sums, c, u, v, reach))
+            u, v, near, reach, how = views[0, n], views[1, n], views[2, n], views[3, n] + NEARER_PX, views[4, n]
+            if how == UNKNOWN:
+                out[n] = True
+            elif how != UNSEEN and not out[n]:
+                out[n] = counts_any(frames, sums, c, u, v, reach + distance * cams[c, 12] / near)
     return out
 
 

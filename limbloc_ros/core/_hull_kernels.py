@@ -277,6 +277,67 @@ def evaluate_blocks(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def replace_voxels(voxels: Any, dropped: Any, new: Any) -> Any:
+    """Those of the voxels (as `evaluate_blocks` gives them) that are not dropped (bool [V]), then the new ones."""
+    count = len(dropped) - np.count_nonzero(dropped)
+    size = count + len(new[0])
+    index = np.empty((size, 3), np.int32)
+    first = np.empty(size, np.float32)
+    second = np.empty(size, np.float32)
+    who = np.empty(size, np.int16)
+    index[count:], first[count:], second[count:], who[count:] = new[0], new[1], new[2], new[3]
+    at = 0
+    for n in range(len(dropped)):
+        if not dropped[n]:
+            for axis in range(3):
+                index[at, axis] = voxels[0][n, axis]
+            first[at], second[at], who[at] = voxels[1][n], voxels[2][n], voxels[3][n]
+            at += 1
+    return index, first, second, who
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def blend_voxels(voxels: Any, doubt: Any, band: Any) -> Any:
+    """Voxels whose distance is below `band`, float32: `doubt` of the way from the largest camera distance to the next.
+
+    Returns indices int32 [V, 3], distances float32 [V] m, and the cameras of the largest uint8 [V].
+    """
+    indices, first, second, who = voxels
+    index = np.empty(indices.shape, np.int32)
+    distance = np.empty(len(first), np.float32)
+    by = np.empty(len(first), np.uint8)
+    count = 0
+    for n in range(len(first)):
+        d = first[n] + doubt * (second[n] - first[n])
+        if d < band:
+            for axis in range(3):
+                index[count, axis] = indices[n, axis]
+            distance[count] = d
+            by[count] = who[n]
+            count += 1
+    return index[:count], distance[:count], by[:count]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def index_range(indices: Any) -> tuple[Any, Any]:
+    """Lowest and highest of indices [V, 3], int64 [3] each."""
+    low = np.full(3, np.iinfo(np.int64).max)
+    high = np.full(3, np.iinfo(np.int64).min)
+    for n in range(len(indices)):
+        for axis in range(3):
+            low[axis] = min(low[axis], indices[n, axis])
+            high[axis] = max(high[axis], indices[n, axis])
+    return low, high
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def fill_grid(grid: Any, indices: Any, low: Any, values: Any) -> None:
+    """Put values [V] into the cells `indices` [V, 3] - `low` of a grid."""
+    for n in range(len(indices)):
+        grid[indices[n, 0] - low[0], indices[n, 1] - low[1], indices[n, 2] - low[2]] = values[n]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def label_components(solid: Any) -> Any:
     """6-connected components of a boolean grid: int32 labels (0 = empty) and the voxel count of each label."""
     nx, ny, nz = solid.shape
@@ -313,3 +374,46 @@ def label_components(solid: Any) -> Any:
                             top += 1
                 sizes.append(size)
     return labels, np.array(sizes)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def label_box(labels: Any, kept: Any) -> tuple[Any, Any]:
+    """Lowest and highest (exclusive) indices of the cells whose labels are kept (bool, one for each label)."""
+    low = np.array(labels.shape)
+    high = np.zeros(3, np.int64)
+    for i in range(labels.shape[0]):
+        for j in range(labels.shape[1]):
+            for k in range(labels.shape[2]):
+                if kept[labels[i, j, k]]:
+                    low[0], low[1], low[2] = min(low[0], i), min(low[1], j), min(low[2], k)
+                    high[0], high[1], high[2] = max(high[0], i + 1), max(high[1], j + 1), max(high[2], k + 1)
+    return low, high
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def grow_part(part: Any, reach: int) -> Any:
+    """The cells of a boolean grid that lie within `reach` of one that is set, along all axes."""
+    nx, ny, nz = part.shape
+    out = np.zeros(part.shape, np.bool_)
+    across = np.zeros(part.shape, np.bool_)
+    for i in range(nx):
+        for j in range(ny):
+            left = 0  # so many cells more are near the last one that is set
+            for k in range(nz):
+                left = reach + 1 if part[i, j, k] else left - 1
+                out[i, j, k] = left > 0
+            left = 0
+            for k in range(nz - 1, -1, -1):
+                left = reach + 1 if part[i, j, k] else left - 1
+                out[i, j, k] |= left > 0
+        for j in range(ny):
+            for other in range(max(j - reach, 0), min(j + reach + 1, ny)):
+                for k in range(nz):
+                    across[i, j, k] |= out[i, other, k]
+    out[:] = False
+    for i in range(nx):
+        for other in range(max(i - reach, 0), min(i + reach + 1, nx)):
+            for j in range(ny):
+                for k in range(nz):
+                    out[i, j, k] |= across[other, j, k]
+    return out

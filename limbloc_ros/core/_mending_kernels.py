@@ -14,45 +14,54 @@ from limbloc_ros.core._projection_kernels import project, project_block, row_sta
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def cover(points: Any, reach: float, cams: Any, boxes: Any, covered: Any) -> None:
-    """Mark the pixels, laid out like `field`, that squares of `reach` (m) around the points [3, P] cover."""
-    run = np.zeros(len(covered), np.int16)  # longest run of covered pixels that begins at a pixel
+    """Mark the pixels, laid out like `field`, that squares of `reach` (m) around the points [3, P] cover.
+
+    Every square adds one at two of its corners and takes one at the others; summed over both axes that is how many
+    squares cover each pixel.
+    """
     seen = np.empty((3, points.shape[1]))
+    square = np.empty((4, points.shape[1]), np.int32)
+    steps = np.empty(np.max((boxes[:, 2] + 1) * (boxes[:, 3] + 1)), np.int32)
     for c in range(len(cams)):
-        x_first = boxes[c, 0]
-        y_first = boxes[c, 1]
-        width = boxes[c, 2]
-        height = boxes[c, 3]
-        offset = boxes[c, 4]
-        top = height
-        bottom = -1
+        width, height, offset = boxes[c, 2], boxes[c, 3], boxes[c, 4]
         project_block(cams, c, points, seen)
+        bound_squares(seen, reach, boxes[c, 0], boxes[c, 1], width, height, square)
+        stride = width + 1
+        steps[: (height + 1) * stride] = 0
+        top, bottom = height, 0
         for n in range(points.shape[1]):
-            if seen[2, n] <= 0.0:
+            x0, x1, y0, y1 = square[0, n], square[1, n], square[2, n], square[3, n]
+            if seen[2, n] <= 0.0 or x0 >= x1 or y0 >= y1:
                 continue
-            u = seen[0, n]
-            v = seen[1, n]
-            r = reach / seen[2, n]
-            x0 = max(0, math.ceil(u - r) - x_first)
-            x1 = min(width - 1, math.floor(u + r) - x_first)
-            y0 = max(0, math.ceil(v - r) - y_first)
-            y1 = min(height - 1, math.floor(v + r) - y_first)
-            length = x1 - x0 + 1
-            if length <= 0 or y0 > y1:
-                continue
-            top = min(top, y0)
-            bottom = max(bottom, y1)
-            at = offset + y0 * width + x0
-            for _ in range(y0, y1 + 1):
-                if run[at] < length:
-                    run[at] = length
-                at += width
-        for y in range(top, bottom + 1):
-            at = offset + y * width
-            left = 0
-            for _ in range(width):
-                left = max(left - 1, run[at])
-                covered[at] = left > 0
-                at += 1
+            top, bottom = min(top, y0), max(bottom, y1)
+            first, last = y0 * stride, y1 * stride
+            steps[first + x0] += 1
+            steps[first + x1] -= 1
+            steps[last + x0] -= 1
+            steps[last + x1] += 1
+        above = np.zeros(stride, np.int32)
+        for y in range(top, bottom):
+            row = steps[y * stride : (y + 1) * stride]
+            for x in range(stride):
+                above[x] += row[x]
+            squares = 0
+            marks = covered[offset + y * width : offset + (y + 1) * width]
+            for x in range(width):
+                squares += above[x]
+                marks[x] = squares > 0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def bound_squares(seen: Any, reach: float, left: int, top: int, width: int, height: int, square: Any) -> None:
+    """First and last (exclusive) column and row of squares of `reach` (m) around pixels, in a piece; int32 [4, P]."""
+    for n in range(seen.shape[1]):
+        u, v = seen[0, n] - left, seen[1, n] - top
+        r = reach / seen[2, n]
+        # What is out of sight may be anywhere, but a number that int32 can hold.
+        square[0, n] = np.int32(math.ceil(min(max(u - r, 0.0), float(width))))
+        square[1, n] = np.int32(math.floor(min(max(u + r, -1.0), width - 1.0))) + np.int32(1)
+        square[2, n] = np.int32(math.ceil(min(max(v - r, 0.0), float(height))))
+        square[3, n] = np.int32(math.floor(min(max(v + r, -1.0), height - 1.0))) + np.int32(1)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
@@ -96,17 +105,42 @@ def count_unexplained(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
-def paint_balls(points: Any, radii: Any, cams: Any, c: int, mask: Any) -> None:
-    """Set to 1 the pixels of one camera's mask (uint8 [height, width]) that the balls cover."""
+def bound_balls(points: Any, radii: Any, cams: Any, c: int) -> tuple[int, int, int, int]:
+    """First and last (exclusive) column and row of one camera's image in which the balls can be seen."""
+    left, top, right, bottom = math.inf, math.inf, -math.inf, -math.inf
+    for n in range(len(points)):
+        u, v, depth = project(cams, c, row_start(cams, c, points[n, 0], points[n, 1]), points[n, 2])
+        if depth > 0.0:
+            r = radii[n] * cams[c, 12] / depth
+            left, right = min(left, u - r), max(right, u + r)
+            top, bottom = min(top, v - r), max(bottom, v + r)
+    width, height = cams[c, 31], cams[c, 32]
+    return (
+        math.ceil(min(max(left, 0.0), width)),
+        math.floor(min(max(right, -1.0), width - 1.0)) + 1,
+        math.ceil(min(max(top, 0.0), height)),
+        math.floor(min(max(bottom, -1.0), height - 1.0)) + 1,
+    )
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def paint_balls(points: Any, radii: Any, cams: Any, c: int, left: int, top: int, mask: Any) -> int:
+    """Set to 1 the pixels of a part of one camera's mask (uint8 [height, width], the first pixel is left, top) that the
+    balls cover; how many were 0 before."""
     height, width = mask.shape
+    painted = 0
     for n in range(len(points)):
         u, v, depth = project(cams, c, row_start(cams, c, points[n, 0], points[n, 1]), points[n, 2])
         if depth <= 0.0:
             continue
         r = radii[n] * cams[c, 12] / depth
+        u -= left
+        v -= top
         y0 = max(0, math.ceil(v - r))
         y1 = min(height - 1, math.floor(v + r))
         for y in range(y0, y1 + 1):
             w = math.sqrt(max(0.0, r * r - (y - v) * (y - v)))
             for x in range(max(0, math.ceil(u - w)), min(width - 1, math.floor(u + w)) + 1):
+                painted += mask[y, x] == 0
                 mask[y, x] = 1
+    return painted

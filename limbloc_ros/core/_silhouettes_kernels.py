@@ -15,21 +15,22 @@ SHORT_PX = 178
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
-def column_distances(mask: Any, far: Any) -> Any:
-    """Distance of every pixel to the nearest one of the other kind in its column, int32; `far` where there is none."""
+def column_distances(mask: Any, out: Any) -> None:
+    """To `out`, uint16: distance of every pixel to the nearest one of the other kind in its column.
+
+    Where there is none: further than every pixel of the mask. (Image sides together have less than 65536 pixels.)
+    """
     height, width = mask.shape
-    out = np.empty((height, width), np.int32)
-    one = np.int32(1)
-    out[0] = far
+    one = np.uint16(1)
+    out[0] = height + width
     for y in range(1, height):
         here, there, row, other = out[y], out[y - 1], mask[y], mask[y - 1]
         for x in range(width):
-            here[x] = there[x] + one if row[x] == other[x] else one
+            here[x] = np.uint16(there[x] + one) if row[x] == other[x] else one
     for y in range(height - 2, -1, -1):
         here, there, row, other = out[y], out[y + 1], mask[y], mask[y + 1]
         for x in range(width):
-            here[x] = min(here[x], there[x] + one if row[x] == other[x] else one)
-    return out
+            here[x] = min(here[x], np.uint16(there[x] + one) if row[x] == other[x] else one)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
@@ -73,7 +74,8 @@ def signed_distance(mask: Any, most: int, deepest: int, numbers: Any, out: Any) 
     twice as many are measured in the same time.
     """
     height, width = mask.shape
-    columns = column_distances(mask, np.int32(height + width))
+    columns = np.empty((height, width), np.uint16)
+    column_distances(mask, columns)
     number = numbers.dtype.type
     pad = max(width, CHUNK) + 4  # the furthest that `nearest_in_row` looks beyond the row's ends
     end = pad + width
@@ -86,10 +88,10 @@ def signed_distance(mask: Any, most: int, deepest: int, numbers: Any, out: Any) 
     for y in range(height):
         row, column, inside, outside = mask[y], columns[y], inner[pad:end], outer[pad:end]
         for x in range(width):
-            d = min(column[x], np.int32(deepest))
+            d = min(np.int32(column[x]), np.int32(deepest))
             inside[x] = d * d if row[x] != 0 else 0
         for x in range(width):
-            d = min(column[x], np.int32(most))
+            d = min(np.int32(column[x]), np.int32(most))
             outside[x] = 0 if row[x] != 0 else d * d
         first, last = 0, width - 1
         while first < width and outside[first] == beyond:

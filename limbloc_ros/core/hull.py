@@ -12,10 +12,8 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import find_objects
 
 from limbloc_ros.core import _block_kernels as near
 from limbloc_ros.core import _hull_kernels as kernels
@@ -122,20 +120,19 @@ class Hull:
         """
         if len(indices) == 0 or len(indices) != len(values):
             raise InputError(f"a hull needs as many signed distances as voxels and at least one, got {len(values)}")
-        columns = np.ascontiguousarray(indices.T)  # each in one piece: reducing is ten times as fast
-        low = columns.min(axis=1).astype(np.int64) - 1
-        shape = tuple(int(n) for n in columns.max(axis=1) - low + 2)
+        low, high = kernels.index_range(indices)
+        low -= 1
+        shape = tuple(int(n) for n in high - low + 2)
         if math.prod(shape) > 100_000_000:
             raise InputError(f"a hull of {shape} cells is too large: expected at most 10^8; use larger voxels")
         sdf = np.full(shape, band_m, np.float32)
-        at = columns - low[:, None]
-        sdf[at[0], at[1], at[2]] = values
+        kernels.fill_grid(sdf, indices, low, values)
         corner = (int(low[0]), int(low[1]), int(low[2]))
         hull = Hull(voxel_m, corner, sdf, band_m, cameras, rejected or {})
         if cut_by is None or viewpoints is None:
             return hull
         grid = np.full(shape, NOBODY, np.uint8)
-        grid[at[0], at[1], at[2]] = cut_by
+        kernels.fill_grid(grid, indices, low, cut_by)
         return replace(hull, cut_by=grid, viewpoints=viewpoints)
 
 
@@ -161,7 +158,7 @@ def evaluate(
     seen, voxel_m, cameras = min_seen(len(silhouettes.names)), silhouettes.voxel_m, silhouettes.cameras
     blocks = silhouettes.blocks
     if changed is not None:
-        blocks = blocks[near.blocks_in_changes(blocks, LEAF, voxel_m, cameras, changed.frames, changed.sums)]
+        blocks = blocks[near.blocks_beside(blocks, LEAF, voxel_m, cameras, changed.frames, changed.sums, 0.0)]
     table = (cameras, silhouettes.boxes, silhouettes.field)
     return kernels.evaluate_blocks(  # type: ignore[no-any-return]
         blocks, *table, voxel_m, band_m, keep_second, seen, silhouettes.lattice[1]
@@ -173,14 +170,9 @@ def evaluate_again(voxels: Voxels, before: Silhouettes, silhouettes: Silhouettes
     changed = silhouettes.changes_since(before)
     new = evaluate(silhouettes, band_m, changed=changed)
     blocks, block_of = near.blocks_of_voxels(voxels[0], silhouettes.lattice[0], LEAF)
-    counts = (changed.frames, changed.sums)
-    same = ~near.blocks_in_changes(blocks, LEAF, silhouettes.voxel_m, silhouettes.cameras, *counts)[block_of]
-    return (
-        np.concatenate([voxels[0][same], new[0]]),
-        np.concatenate([voxels[1][same], new[1]]),
-        np.concatenate([voxels[2][same], new[2]]),
-        np.concatenate([voxels[3][same], new[3]]),
-    )
+    table = (silhouettes.voxel_m, silhouettes.cameras, changed.frames, changed.sums)
+    dropped = near.blocks_beside(blocks, LEAF, *table, 0.0)[block_of]
+    return kernels.replace_voxels(voxels, dropped, new)  # type: ignore[no-any-return]
 
 
 def evaluate_live(silhouettes: Silhouettes, config: HullConfig) -> tuple[Silhouettes, Voxels]:
@@ -256,13 +248,14 @@ def mend_silhouettes(
     # a third from ragged ones.
     deep = depths > (config.repair_depth_m if len(silhouettes.names) >= 6 else np.inf)
     give_back = (unexplained >= 2) | deep
-    changes: dict[int, NDArray[np.uint8]] = {}
-    for c in np.unique(deniers[give_back]):
+    changes: dict[int, tuple[NDArray[np.uint8], int, int]] = {}
+    for c in map(int, np.unique(deniers[give_back])):
         mine = give_back & (deniers == c)
-        mask = silhouettes.masks[c].copy()
-        mending.paint_balls(points[mine], np.maximum(depths[mine], half), silhouettes.cameras, int(c), mask)
-        if cv2.countNonZero(mask) > cv2.countNonZero(silhouettes.masks[c]):
-            changes[int(c)] = mask
+        balls = (points[mine], np.maximum(depths[mine], half), silhouettes.cameras, c)
+        left, right, top, bottom = mending.bound_balls(*balls)
+        mask, left, top = silhouettes.part_of_mask(c, left, right, top, bottom)
+        if mending.paint_balls(*balls, left, top, mask):
+            changes[c] = mask, left, top
     return silhouettes.with_masks(changes) if changes else silhouettes
 
 
@@ -282,24 +275,22 @@ def carve_silhouettes(silhouettes: Silhouettes, rig: Rig, config: HullConfig) ->
     mended = mend_silhouettes(silhouettes, covered, voxels, config)
     if mended is not silhouettes:
         voxels = evaluate_again(voxels, silhouettes, mended, config.band_m)
-    indices, first, second, who = voxels
     # Ragged masks bite a little from every side. The more the cameras contradict each other, the less may a single
     # one decide; with few cameras two vetoes would leave far too much.
     doubt = 0.0
     if len(silhouettes.names) >= 6:
         doubt = min(1.0, contradiction / DOUBTED_FRACTION) * config.shared_veto
-    distance = (first + np.float32(doubt) * (second - first)).astype(np.float32)
-    near = distance < np.float32(config.band_m)
-    if not (distance[near] < 0).any():
+    indices, distance, who = kernels.blend_voxels(voxels, np.float32(doubt), np.float32(config.band_m))
+    if not (distance < 0).any():
         return NoPerson("the silhouettes have no volume in common: is anybody in the carve volume?")
     hull = Hull.from_shell(
         config.voxel_m,
         config.band_m,
-        indices[near],
-        distance[near],
+        indices,
+        distance,
         silhouettes.names,
         silhouettes.rejected,
-        who[near].astype(np.uint8),
+        who,
         np.stack([rig.camera(name).T_world_camera[:3, 3] for name in silhouettes.names]).astype(np.float32),
     )
     labels, sizes = _label(hull)
@@ -381,15 +372,7 @@ def _with_labels(hull: Hull, labels: NDArray[np.int32], keep: list[int]) -> Hull
     reach = math.ceil(hull.band_m / hull.voxel_m)
     hull, labels = _around(hull, labels, keep, reach + 1)
     part = labels == keep[0] if len(keep) == 1 else np.isin(labels, keep)
-    near = part.copy()
-    for axis in range(3):
-        grown = near.copy()
-        for step in range(1, reach + 1):
-            ahead, behind = [slice(None)] * 3, [slice(None)] * 3
-            ahead[axis], behind[axis] = slice(step, None), slice(None, -step)
-            grown[tuple(ahead)] |= near[tuple(behind)]
-            grown[tuple(behind)] |= near[tuple(ahead)]
-        near = grown
+    near = kernels.grow_part(part, reach)
     kept = near & ((labels == 0) | part)
     sdf = np.where(kept, hull.sdf, np.float32(hull.band_m))
     cut_by = None if hull.cut_by is None else np.where(kept, hull.cut_by, np.uint8(NOBODY))
@@ -398,9 +381,9 @@ def _with_labels(hull: Hull, labels: NDArray[np.int32], keep: list[int]) -> Hull
 
 def _around(hull: Hull, labels: NDArray[np.int32], keep: list[int], margin: int) -> tuple[Hull, NDArray[np.int32]]:
     """Hull and labels cut to the box around some parts with a margin of so many voxels."""
-    boxes = find_objects(labels)
-    low = np.min([[axis.start for axis in boxes[label - 1]] for label in keep], axis=0)
-    high = np.max([[axis.stop for axis in boxes[label - 1]] for label in keep], axis=0)
+    kept = np.zeros(int(labels.max()) + 1, np.bool_)
+    kept[keep] = True
+    low, high = kernels.label_box(labels, kept)
     low, high = np.maximum(low - margin, 0), np.minimum(high + margin, labels.shape)
     cut = tuple(slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
     i, j, k = (int(a + b) for a, b in zip(hull.index_min, low, strict=True))

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import cv2
@@ -37,19 +37,33 @@ class PixelCounts:
     sums: NDArray[np.int32]
 
     @staticmethod
-    def of(pieces: Sequence[NDArray[np.uint8]], corners: Sequence[tuple[int, int]] | None = None) -> PixelCounts:
-        """Count the ones of images [height, width] of 0 and 1, or of pieces whose first pixels are `corners`."""
-        frames = np.zeros((len(pieces), 5), np.int64)
-        sums = []
-        offset = 0
-        for c, piece in enumerate(pieces):
+    def of(pieces: Iterable[tuple[NDArray[np.uint8], int, int]]) -> PixelCounts:
+        """Count the ones of pieces [height, width] of 0 and 1 of every image, each with its first column and row."""
+        parts = []
+        for piece, left, top in pieces:
             x, y, width, height = cv2.boundingRect(piece) if piece.size else (0, 0, 0, 0)
-            left, top = corners[c] if corners is not None else (0, 0)
-            frames[c] = left + x, top + y, width, height, offset
-            if width:
-                sums.append(cv2.integral(piece[y : y + height, x : x + width]).ravel())
-                offset += sums[-1].size
-        return PixelCounts(frames, np.concatenate(sums) if sums else np.zeros(0, np.int32))
+            sums = cv2.integral(piece[y : y + height, x : x + width]).ravel() if width else np.zeros(0, np.int32)
+            parts.append(((left + x, top + y, width, height), sums))
+        return PixelCounts._joined(parts)
+
+    def pick(self, cameras: Iterable[int], replaced: Mapping[int, PixelCounts] | None = None) -> PixelCounts:
+        """The same of some camera numbers, those of `replaced` with the first camera's counts there."""
+        parts = []
+        for c in cameras:
+            source, row = (self, c) if replaced is None or c not in replaced else (replaced[c], 0)
+            x, y, width, height, offset = (int(n) for n in source.frames[row])
+            size = (width + 1) * (height + 1) if width else 0
+            parts.append(((x, y, width, height), source.sums[offset : offset + size]))
+        return PixelCounts._joined(parts)
+
+    @staticmethod
+    def _joined(parts: list[tuple[tuple[int, int, int, int], NDArray[np.int32]]]) -> PixelCounts:
+        frames = np.zeros((len(parts), 5), np.int64)
+        offset = 0
+        for c, (frame, sums) in enumerate(parts):
+            frames[c] = *frame, offset
+            offset += sums.size
+        return PixelCounts(frames, np.concatenate([sums for _, sums in parts] or [np.zeros(0, np.int32)]))
 
 
 @dataclass(frozen=True)
@@ -62,8 +76,8 @@ class Silhouettes:
         boxes: int64 [C, 5] x0, y0, width, height of each piece and its offset in `field`.
         field: float32, the pieces one after the other.
         rejected: camera name -> why it does not take part.
-        masks: the whole masks, uint8 [height, width], 0 or 1; regions to ignore are foreground, so that nothing is
-            carved there.
+        masks: the smallest rectangle around each mask's foreground (`counts.frames` says where), uint8 [height, width],
+            0 or 1; regions to ignore are foreground, so that nothing is carved there.
         counts: how many foreground pixels each mask has up to a pixel.
         margins: float64 [C] px from a mask to its piece's border, and the largest distance in it: further out, every
             point that can matter is further from the silhouette than the band.
@@ -93,27 +107,62 @@ class Silhouettes:
         _, _, width, height, offset = self.boxes[c]
         return self.field[offset : offset + width * height].reshape(height, width)
 
-    def with_masks(self, masks: Mapping[int, NDArray[np.uint8]]) -> Silhouettes:
-        """The same with the whole masks (0 or 1) of some camera numbers replaced."""
-        new = tuple(masks.get(c, mask) for c, mask in enumerate(self.masks))
-        return _measured(replace(self, masks=new, counts=PixelCounts.of(new)), self)
+    def whole_mask(self, c: int) -> NDArray[np.uint8]:
+        """[height, width] the mask of camera number c, 0 or 1, as large as its image."""
+        return self.part_of_mask(c, 0, int(self.cameras[c, 31]), 0, int(self.cameras[c, 32]))[0]
+
+    def part_of_mask(self, c: int, left: int, right: int, top: int, bottom: int) -> tuple[NDArray[np.uint8], int, int]:
+        """A copy of camera number c's mask, as much as holds all foreground and these columns and rows.
+
+        The last column and row are exclusive.
+
+        Returns:
+            the part [height, width], 0 or 1, and its first column and row.
+        """
+        x, y, width, height, _ = (int(n) for n in self.counts.frames[c])
+        left, top, right, bottom = min(left, x), min(top, y), max(right, x + width), max(bottom, y + height)
+        part = np.zeros((bottom - top, right - left), np.uint8)
+        part[y - top : y - top + height, x - left : x - left + width] = self.masks[c]
+        return part, left, top
+
+    def with_masks(self, masks: Mapping[int, tuple[NDArray[np.uint8], int, int]]) -> Silhouettes:
+        """The same with the masks (0 or 1) of some camera numbers replaced by larger ones.
+
+        Of each the part that holds all foreground, and its first column and row.
+        """
+        new = {c: _outlined(*part) for c, part in masks.items()}
+        every = tuple(new[c][0] if c in new else mask for c, mask in enumerate(self.masks))
+        counts = self.counts.pick(range(len(every)), {c: PixelCounts.of([part]) for c, part in new.items()})
+        return _measured(replace(self, masks=every, counts=counts), self)
 
     def without(self, name: str, why: str) -> Silhouettes:
         """The same without one camera."""
         keep = [i for i, other in enumerate(self.names) if other != name]
-        masks = tuple(self.masks[i] for i in keep)
         rest = replace(
             self,
             names=tuple(self.names[i] for i in keep),
             cameras=self.cameras[keep],
             boxes=self.boxes[keep],
             rejected={**self.rejected, name: why},
-            masks=masks,
-            counts=PixelCounts.of(masks),
+            masks=tuple(self.masks[i] for i in keep),
+            counts=self.counts.pick(keep),
             margins=self.margins[keep],
+            blocks=self.blocks[:0],  # without a camera there are more: all are looked for again
             ignored=tuple(self.ignored[i] for i in keep),
         )
         return _measured(rest, rest)
+
+    def gained_since(self, before: Silhouettes) -> PixelCounts:
+        """How many foreground pixels of each image, up to a pixel, were none before."""
+        gained = []
+        for c, mask in enumerate(self.masks):
+            x, y, width, height, _ = (int(n) for n in self.counts.frames[c])
+            if mask is before.masks[c]:
+                gained.append((mask[:0], x, y))
+                continue
+            was, _, _ = before.part_of_mask(c, x, x + width, y, y + height)
+            gained.append((np.greater(mask, was).view(np.uint8), x, y))
+        return PixelCounts.of(gained)
 
     def changes_since(self, before: Silhouettes) -> PixelCounts:
         """Where another distance than before is read, if it is nearer than the margin; the masks may only have grown.
@@ -121,20 +170,19 @@ class Silhouettes:
         Returns:
             how many such pixels each image has up to a pixel.
         """
-        changed, corners = [], []
+        changed = []
         for c, mask in enumerate(self.masks):
-            x, y, width, height, _ = self.boxes[c]
-            corners.append((int(x), int(y)))
+            x, y, width, height, _ = (int(n) for n in self.boxes[c])
             if mask is before.masks[c]:
-                changed.append(np.zeros((0, 0), np.uint8))
+                changed.append((np.zeros((0, 0), np.uint8), x, y))
                 continue
             x_old, y_old, width_old, height_old, _ = before.boxes[c]
             x0, x1 = max(x, x_old), min(x + width, x_old + width_old)
             y0, y1 = max(y, y_old), min(y + height, y_old + height_old)
             old = np.full((height, width), self.margins[c] - 0.5, np.float32)
             old[y0 - y : y1 - y, x0 - x : x1 - x] = before.piece(c)[y0 - y_old : y1 - y_old, x0 - x_old : x1 - x_old]
-            changed.append((self.piece(c) < old).view(np.uint8))
-        return PixelCounts.of(changed, corners)
+            changed.append((np.less(self.piece(c), old).view(np.uint8), x, y))
+        return PixelCounts.of(changed)
 
 
 def signed_distance_px(mask: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -161,11 +209,18 @@ def cleaned(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
     Returns:
         uint8 [height, width], 0 or 1.
     """
-    x, y, width, height = cv2.boundingRect(mask)
+    piece, x, y = _cleaned_piece(mask)
     out = np.zeros(mask.shape, np.uint8)
+    out[y : y + piece.shape[0], x : x + piece.shape[1]] = piece
+    return out
+
+
+def _cleaned_piece(mask: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], int, int]:
+    """The part of the cleaned mask that holds all its foreground, and its first column and row."""
+    x, y, width, height = cv2.boundingRect(mask)
+    piece = np.not_equal(mask[y : y + height, x : x + width], 0).view(np.uint8)
     if width == 0:
-        return out
-    piece = np.not_equal(mask[y : y + height, x : x + width], 0).astype(np.uint8)
+        return piece, x, y
     contours, hierarchy = cv2.findContours(piece, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
     if len(contours) > 1:
         # A contour runs through the centres of its pixels: half its length more is the area of the pixels themselves,
@@ -179,8 +234,7 @@ def cleaned(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
             cv2.drawContours(piece, [contours[i]], 0, 0, cv2.FILLED)
         for i in map(int, np.flatnonzero(~outer & (area < 0.015 * largest))):
             cv2.drawContours(piece, [contours[i]], 0, 1, cv2.FILLED)
-    out[y : y + height, x : x + width] = piece
-    return out
+    return piece, x, y
 
 
 def pack_cameras(rig: Rig) -> NDArray[np.float64]:
@@ -236,7 +290,7 @@ def measure_silhouettes(
                 f"camera {name}: expected a mask of {camera.width}x{camera.height} px as in the rig, "
                 f"got {'x'.join(map(str, mask.shape[::-1]))}; is the stream scaled, or the rig file another camera's?"
             )
-    usable: list[NDArray[np.uint8]] = []
+    usable: list[tuple[NDArray[np.uint8], int, int]] = []
     ignored: list[NDArray[np.uint8] | None] = []
     rows: list[int] = []
     rejected: dict[str, str] = {}
@@ -245,23 +299,28 @@ def measure_silhouettes(
             rejected[camera.name] = "no mask"
             continue
         blind = camera.ignored_pixels()
-        mask = cleaned(masks[camera.name] if blind is None else np.where(blind, np.uint8(0), masks[camera.name]))
-        foreground = cv2.countNonZero(mask)
+        mask = masks[camera.name] if blind is None else np.where(blind, np.uint8(0), masks[camera.name])
+        piece, x, y = _cleaned_piece(mask)
+        foreground = cv2.countNonZero(piece) if piece.size else 0
         if foreground == 0:
             rejected[camera.name] = "empty mask"
         elif foreground > 0.9 * mask.size:
             rejected[camera.name] = "mask is all foreground"
         else:
-            usable.append(mask if blind is None else mask | blind)
+            if blind is not None:
+                whole = blind.copy()
+                whole[y : y + piece.shape[0], x : x + piece.shape[1]] |= piece
+                piece, x, y = whole, 0, 0
+            usable.append(_outlined(piece, x, y))
             ignored.append(blind)
             rows.append(row)
-    whole = Silhouettes(
+    silhouettes = Silhouettes(
         names=tuple(rig.cameras[row].name for row in rows),
         cameras=packed[rows],
         boxes=np.zeros((len(rows), 5), np.int64),
         field=np.zeros(0, np.float32),
         rejected=rejected,
-        masks=tuple(usable),
+        masks=tuple(piece for piece, _, _ in usable),
         counts=PixelCounts.of(usable),
         margins=np.zeros(len(rows)),
         voxel_m=config.voxel_m,
@@ -270,7 +329,13 @@ def measure_silhouettes(
         blocks=np.zeros((0, 3), np.int32),
         ignored=tuple(ignored),
     )
-    return _measured(whole, None) if rows else whole
+    return _measured(silhouettes, None) if rows else silhouettes
+
+
+def _outlined(mask: NDArray[np.uint8], left: int, top: int) -> tuple[NDArray[np.uint8], int, int]:
+    """The smallest rectangle around the foreground of a mask whose first pixel is (left, top), and its first pixel."""
+    x, y, width, height = cv2.boundingRect(mask)
+    return mask[y : y + height, x : x + width], left + x, top + y
 
 
 def lattice_bounds(rig: Rig, voxel_m: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -290,11 +355,13 @@ def _measured(whole: Silhouettes, old: Silhouettes | None) -> Silhouettes:
 
     Args:
         whole: masks and counts are right, all else is replaced.
-        old: has pieces that may still do.
+        old: has pieces and blocks that may still do.
     """
-    blocks, nearest = _near_blocks(whole)
+    blocks = _near_blocks(whole, old)
+    nearest = near.nearest_depths(blocks, LEAF, whole.voxel_m, whole.cameras)
     count = len(whole.names)
-    margins = np.array([float(sum(mask.shape)) for mask in whole.masks])
+    images = whole.cameras[:, 31:33].astype(np.int64)  # width, height
+    margins = images.sum(axis=1).astype(np.float64)
     seen = nearest > 0
     margins[seen] = np.minimum(margins[seen], np.ceil(whole.cameras[seen, 12] * whole.band_m / nearest[seen]) + 2)
     boxes = np.zeros((count, 5), np.int64)
@@ -309,18 +376,18 @@ def _measured(whole: Silhouettes, old: Silhouettes | None) -> Silhouettes:
             x, y, width, height, _ = whole.counts.frames[c]
             margin = int(margins[c])
             x0, y0 = max(x - margin, 0), max(y - margin, 0)
-            x1, y1 = min(x + width + margin, mask.shape[1]), min(y + height + margin, mask.shape[0])
+            x1, y1 = min(x + width + margin, images[c, 0]), min(y + height + margin, images[c, 1])
             boxes[c, :4] = x0, y0, x1 - x0, y1 - y0
         boxes[c, 4] = offset
         offset += int(boxes[c, 2] * boxes[c, 3])
     field = np.empty(offset, np.float32)
     measured = replace(whole, boxes=boxes, margins=margins, field=field, blocks=blocks)
-    for c, mask in enumerate(whole.masks):
+    for c in range(count):
         if old is not None and reused[c]:
             measured.piece(c)[:] = old.piece(c)
         else:
-            x, y, width, height, _ = boxes[c]
-            piece = np.ascontiguousarray(mask[y : y + height, x : x + width])
+            x, y, width, height, _ = (int(n) for n in boxes[c])
+            piece, _, _ = whole.part_of_mask(c, x, x + width, y, y + height)
             _measure(piece, int(margins[c]), measured.piece(c))
     return measured
 
@@ -333,19 +400,29 @@ def _measure(mask: NDArray[np.uint8], most: int, out: NDArray[np.float32]) -> No
         kernels.signed_distance(mask, min(most, far), far, np.empty(0, np.int32), out)
 
 
-def _near_blocks(whole: Silhouettes) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
-    """The blocks of LEAF voxels [B, 3] that can hold voxels that matter, and the nearest one's depth [C] in m.
+def _near_blocks(whole: Silhouettes, old: Silhouettes | None) -> NDArray[np.int32]:
+    """The blocks of LEAF voxels [B, 3] that can hold voxels that matter.
 
-    Found by halving blocks that may hold some, which the masks alone tell. The depth is inf for cameras that see none.
+    Found by halving blocks that may hold some, which the masks alone tell; those that `old` has remain, and only beside
+    the foreground that was gained since then there can be more.
     """
     low, high = whole.lattice
     axes = [np.arange(low[a], high[a], ROOT, dtype=np.int32) for a in range(3)]
-    blocks = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    table = (whole.cameras, whole.counts.frames, whole.counts.sums, whole.band_m, min_seen(len(whole.names)))
+    blocks: NDArray[np.int32] = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    gained = whole.gained_since(old) if old is not None and len(old.blocks) else None
+    seen = min_seen(len(whole.names))
     size = ROOT
     while True:
-        blocks = near.near_blocks(blocks, size, whole.voxel_m, *table)
+        table = (size, whole.voxel_m, whole.cameras)
+        if gained is not None:
+            blocks = blocks[near.blocks_beside(blocks, *table, gained.frames, gained.sums, whole.band_m)]
+        blocks = blocks[near.near_blocks(blocks, *table, whole.counts.frames, whole.counts.sums, whole.band_m, seen)]
         if size == LEAF:
-            return blocks, near.nearest_depths(blocks, size, whole.voxel_m, whole.cameras)
+            break
         blocks = near.split_blocks(blocks, size, high)
         size //= 2
+    if old is None or gained is None:
+        return blocks
+    known = near.near_blocks(blocks, *table, old.counts.frames, old.counts.sums, whole.band_m, seen)
+    grown: NDArray[np.int32] = np.concatenate([old.blocks, blocks[~known]])
+    return grown
