@@ -86,6 +86,11 @@ class Watcher:
             self.statuses[status.name] = status
 
 
+def pids(graph: Supervisor) -> dict[str, int]:
+    """Process ids by name, with the process that forks the others."""
+    return graph.pids | ({} if graph.server_pid is None else {"(forks them)": graph.server_pid})
+
+
 def cpu_s(pid: int) -> float:
     """User and system time of a process with all its threads, s."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
@@ -137,14 +142,14 @@ def main() -> int:
                     print("\n".join(lines), file=sys.stderr)
                     return 1
                 watcher.spin()
-            begin_s, begin_ns, begin_cpu = time.monotonic(), time.time_ns(), {p: cpu_s(p) for p in graph.pids.values()}
+            begin_s, begin_ns, begin_cpu = time.monotonic(), time.time_ns(), {p: cpu_s(p) for p in pids(graph).values()}
             begin_all, begin_me = machine_cpu_s(), time.process_time()
             while time.monotonic() - begin_s < args.seconds:
                 graph.poll()
                 watcher.spin()
             seconds, end_ns = time.monotonic() - begin_s, time.time_ns()
             others = machine_cpu_s() - begin_all - (time.process_time() - begin_me)
-            used = {name: (cpu_s(p) - begin_cpu.get(p, 0.0), *memory_mb(p)) for name, p in graph.pids.items()}
+            used = {name: (cpu_s(p) - begin_cpu.get(p, 0.0), *memory_mb(p)) for name, p in pids(graph).items()}
             settled = time.monotonic() + 2.0
             while time.monotonic() < settled:
                 watcher.spin()

@@ -19,7 +19,7 @@ from sensor_msgs.msg import CompressedImage, Image
 from std_msgs.msg import Header
 
 from limbloc_ros.core.errors import ConfigError, InputError, RigError
-from limbloc_ros.nodes import composed, smart_space
+from limbloc_ros.nodes import composed, process_server, smart_space
 from limbloc_ros.nodes.graph_plan import SmartSpaceConfig, load_config, plan_graph
 from limbloc_ros.recordings.bags import BagReader, BagWriter
 from limbloc_ros.rig.rig_file import load_rig, save_rig
@@ -341,17 +341,25 @@ def test_what_the_server_forks_outlives_it_and_a_new_one_is_started(observer):
         before = supervisor.pids
         me = psutil.Process()
         assert {psutil.Process(pid).ppid() for pid in before.values()} == {me.pid}
-        (server,) = (
-            child
-            for child in me.children()
-            if "process_server" in " ".join(child.cmdline()[1:4]) and child.pid not in before.values()
-        )
+        server = psutil.Process(supervisor.server_pid)
+        assert {Path(f"/proc/{pid}/comm").read_text().strip() for pid in before.values()} == set(before)
         assert server.num_threads() == 1
         server.kill()
         os.kill(before["cameras_1"], signal.SIGKILL)
         wait_until(lambda: supervisor.poll() and supervisor.restarts["cameras_1"] == 1)
         assert supervisor.pids["cameras_2"] == before["cameras_2"]
         wait_until(lambda: {"segmentation_cam0", "segmentation_cam1"} <= set(observer.get_node_names()))
+
+
+def test_a_start_that_compiles_says_so(monkeypatch, capsys):
+    monkeypatch.setattr(process_server, "PATIENCE_S", 0.05)
+    monkeypatch.setattr(process_server, "resolve_name", lambda name: lambda: time.sleep(0.2))
+    handler = signal.signal(signal.SIGALRM, process_server.explain)
+    try:
+        process_server.prepare(plan("pose", ("pose", "pose", {})).description)
+    finally:
+        signal.signal(signal.SIGALRM, handler)
+    assert "compiles" in capsys.readouterr().out
 
 
 def test_the_delay_grows_while_a_process_keeps_dying():

@@ -51,7 +51,7 @@ def main() -> int:
     signal.pthread_sigmask(signal.SIG_BLOCK, _ASKED_TO_END)
     supervisor = os.getppid()
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    signal.signal(signal.SIGALRM, _explain)
+    signal.signal(signal.SIGALRM, explain)
     cv2.setNumThreads(1)
     gc.disable()  # nothing of what is imported becomes garbage, and a collection would write to all shared pages
     with socket.socket(fileno=int(sys.argv[1])) as channel:
@@ -132,7 +132,8 @@ def become(request: dict[str, Any], output: int, supervisor: int) -> NoReturn:
         os._exit(1)
 
 
-def _explain(_number: int, _frame: FrameType | None) -> None:
+def explain(_number: int, _frame: FrameType | None) -> None:
+    """Tell people what takes so long (a signal handler: a second thread would not do)."""
     print("loading the numeric kernels; the first start compiles them, which takes a minute or more")
 
 

@@ -121,6 +121,11 @@ class Supervisor:
         self._meet_started(time.monotonic())
         return {c.plan.name: c.process.pid for c in self._children if c.process and c.process.poll() is None}
 
+    @property
+    def server_pid(self) -> int | None:
+        """Process id of what forks the others; None before the start and after the end."""
+        return None if self._starter.server is None else self._starter.server.pid
+
     def start(self) -> None:
         """Have all processes started, in their order; `poll` sees when they run."""
         try:
