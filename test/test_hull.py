@@ -12,6 +12,7 @@ from scipy import ndimage
 
 from limbloc_ros.core import hull as hulls
 from limbloc_ros.core import pipeline
+from limbloc_ros.core import silhouettes as outlines
 from limbloc_ros.core.camera import Camera, Rig
 from limbloc_ros.core.config import HullConfig
 from limbloc_ros.core.errors import InputError, NoPerson, RigError
@@ -231,6 +232,10 @@ def test_changed_masks_are_evaluated_again_as_if_from_scratch():
         again = evaluate_again(voxels, before, after, 0.12)
         scratch = evaluate(after, 0.12)
         for mine, theirs in zip(in_order(again), in_order(scratch), strict=True):
+            np.testing.assert_array_equal(mine, theirs)
+        fresh = outlines._measured(after, None)  # not from what was known before the masks grew
+        assert set(map(tuple, after.blocks.tolist())) == set(map(tuple, fresh.blocks.tolist()))
+        for mine, theirs in zip(in_order(again), in_order(evaluate(fresh, 0.12)), strict=True):
             np.testing.assert_array_equal(mine, theirs)
         whole = {name: after.whole_mask(c) for c, name in enumerate(after.names)}
         assert_exact(rig, whole, 0.16, 0.12)
@@ -651,6 +656,13 @@ def test_largest_component_drops_the_rest_and_its_shell():
     kept = largest_component(both)
     assert kept.index_min == alone.index_min
     np.testing.assert_array_equal(kept.sdf, alone.sdf)
+
+
+@pytest.mark.parametrize("reach", [0, 1, 3, 9])
+def test_parts_grow_along_all_axes(reach):
+    part = np.random.default_rng(reach).random((7, 1, 13)) < 0.03
+    grown = ndimage.binary_dilation(part, np.ones((2 * reach + 1,) * 3, bool))
+    np.testing.assert_array_equal(hulls.kernels.grow_part(part, reach), grown)
 
 
 def test_largest_component_keeps_who_cut_where_it_was():

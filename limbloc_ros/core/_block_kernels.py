@@ -149,9 +149,10 @@ def blocks_of_voxels(indices: Any, lower: Any, size: int) -> tuple[Any, Any]:
     for n in range(len(indices)):
         same = count > 0
         for axis in range(3):
-            at = lower[axis] + (indices[n, axis] - lower[axis]) // size * size
-            same = same and blocks[count - 1, axis] == at
-            blocks[count, axis] = at
-        count += not same
+            same = same and 0 <= indices[n, axis] - blocks[count - 1, axis] < size
+        if not same:
+            for axis in range(3):
+                blocks[count, axis] = lower[axis] + (indices[n, axis] - lower[axis]) // size * size
+            count += 1
         of[n] = count - 1
     return blocks[:count], of

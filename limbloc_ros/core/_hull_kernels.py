@@ -394,26 +394,27 @@ def label_box(labels: Any, kept: Any) -> tuple[Any, Any]:
 def grow_part(part: Any, reach: int) -> Any:
     """The cells of a boolean grid that lie within `reach` of one that is set, along all axes."""
     nx, ny, nz = part.shape
-    out = np.zeros(part.shape, np.bool_)
+    along = np.zeros(part.shape, np.bool_)
     across = np.zeros(part.shape, np.bool_)
+    out = np.zeros(part.shape, np.bool_)
     for i in range(nx):
         for j in range(ny):
-            left = 0  # so many cells more are near the last one that is set
-            for k in range(nz):
-                left = reach + 1 if part[i, j, k] else left - 1
-                out[i, j, k] = left > 0
-            left = 0
-            for k in range(nz - 1, -1, -1):
-                left = reach + 1 if part[i, j, k] else left - 1
-                out[i, j, k] |= left > 0
+            row, grown = part[i, j], along[i, j]
+            for step in range(min(reach + 1, nz)):
+                for k in range(nz - step):
+                    grown[k] |= row[k + step]
+                for k in range(nz - step):
+                    grown[k + step] |= row[k]
         for j in range(ny):
+            grown = across[i, j]
             for other in range(max(j - reach, 0), min(j + reach + 1, ny)):
+                row = along[i, other]
                 for k in range(nz):
-                    across[i, j, k] |= out[i, other, k]
-    out[:] = False
+                    grown[k] |= row[k]
     for i in range(nx):
         for other in range(max(i - reach, 0), min(i + reach + 1, nx)):
             for j in range(ny):
+                row, grown = across[other, j], out[i, j]
                 for k in range(nz):
-                    out[i, j, k] |= across[other, j, k]
+                    grown[k] |= row[k]
     return out

@@ -192,7 +192,7 @@ def evaluate_live(silhouettes: Silhouettes, config: HullConfig) -> tuple[Silhoue
         if denied[worst] < 2 * kept + config.min_voxels or denied[worst] < 2 * others.max():
             return silhouettes, voxels
         silhouettes = silhouettes.without(
-            silhouettes.names[worst], f"its mask denies {denied[worst] / max(kept, 1):.1f} times the hull that stays"
+            silhouettes.names[worst], f"its mask alone denies {denied[worst]} voxels, of the hull only {kept} stay"
         )
 
 
