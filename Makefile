@@ -8,7 +8,7 @@ VENV ?= .venv
 RUN := $(VENV)/bin/python
 STAMP := $(VENV)/.ready-$(ROS)
 
-.PHONY: help setup demo test lint bench soak fuzz docs clean
+.PHONY: help setup demo test lint bench soak fuzz docs docs-images clean
 
 help:
 	@echo "make demo    set up, run the smart space on simulated cameras for 30 s, leave bag, CSV and report in out/"
@@ -19,6 +19,7 @@ help:
 	@echo "make soak    half an hour of the live graph: what grows, what leaks (ARGS='--minutes 10' for less)"
 	@echo "make fuzz    100,000 damaged inputs for each reader; an hour or two (ARGS='--runs 1000' for less)"
 	@echo "make docs    build the documentation as a site in site/, strictly"
+	@echo "make docs-images   draw the documentation's pictures anew (tools/draw_docs_images.py)"
 	@echo "make clean   remove .venv and what tools left behind"
 
 setup: $(STAMP)
@@ -67,6 +68,9 @@ docs: setup
 	  $(RUN) -m pip install -qq --disable-pip-version-check --require-hashes -r requirements/docs.lock
 	@NO_MKDOCS_2_WARNING=1 $(RUN) -m mkdocs build --strict --quiet
 	@echo "the documentation is in site/index.html"
+
+docs-images: setup
+	@$(RUN) tools/draw_docs_images.py $(ARGS)
 
 clean:
 	rm -rf "$(VENV)" site build install log .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info

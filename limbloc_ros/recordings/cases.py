@@ -146,7 +146,10 @@ def _read_truth(path: Path, frames: int) -> dict[str, Array]:
 def joints_of(archive: Mapping[str, NDArray[Any]], path: Path) -> tuple[Array, tuple[str, ...]]:
     """Joints [F, J, 3] m and their names out of an archive; raises InputError when they are not there or do not fit."""
     if not {"joints", "joint_names"} <= set(archive):
-        raise InputError(f"{path}: expected joints and joint_names, got {', '.join(archive) or 'nothing'}")
+        raise InputError(
+            f"{path}: expected joints [N, J, 3] m and joint_names [J], got {', '.join(archive) or 'nothing'}; save the "
+            "arrays under these names"
+        )
     joints, names = archive["joints"], archive["joint_names"]
     if names.dtype.kind != "U" or names.ndim != 1 or joints.dtype.kind not in "fiu":
         raise InputError(

@@ -145,7 +145,7 @@ def energy_and_confidence(run: RunData) -> Figure:
         trace(top, run, time, run.energy, BLUE)
         if doubtful.any():
             top.plot(time[doubtful], run.energy[doubtful], "o", color=ORANGE, markersize=7, label="not reliable")
-            top.legend(loc="upper right")
+            top.legend(loc="lower right")
         top.set_ylabel("XOR energy (1)")
         top.set_ylim(0, max(0.3, 1.15 * _largest(run.energy)))
         top.set_title("energy: 0 is a perfect overlap of figure and hull")

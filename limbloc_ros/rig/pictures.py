@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
@@ -120,10 +121,11 @@ def coverage_map(coverage: Coverage, rig: Rig) -> bytes:
     half = STEP_M / 2
     extent = (coverage.x[0] - half, coverage.x[-1] + half, coverage.y[0] - half, coverage.y[-1] + half)
     how: dict[str, Any] = {"origin": "lower", "extent": extent, "interpolation": "nearest"}
-    image = axes.imshow(coverage.whole.T, cmap="viridis", vmin=-0.5, vmax=most + 0.5, **how)
+    steps = colormaps["viridis"].resampled(most + 1)
+    image = axes.imshow(coverage.whole.T, cmap=steps, vmin=-0.5, vmax=most + 0.5, **how)
     bad = np.where(coverage.needed > coverage.whole.T, 1.0, np.nan)
     axes.imshow(bad, cmap="autumn", vmin=0.9, vmax=2, alpha=0.55, **how)
-    figure.colorbar(image, ax=axes, label="cameras", ticks=range(0, most + 1, max(1, most // 8)))
+    figure.colorbar(image, ax=axes, label="cameras", ticks=range(0, most + 1, max(1, most // 8)), shrink=0.7)
     for i, camera in enumerate(rig.cameras):
         x, y = camera.T_world_camera[:2, 3]
         dx, dy = camera.T_world_camera[:2, 2]
@@ -208,7 +210,7 @@ def rig_picture(
             zlabel="z m" if column == 0 else "",
         )
         spans = highest - lowest + 2 * margin
-        axes.set_box_aspect(spans, zoom=1.0)
+        axes.set_box_aspect(spans, zoom=0.92 if column == 0 else 1.0)  # room for the heights' label
         axes.view_init(elevation, azimuth)
         if column == 1:
             axes.set_proj_type("ortho")
