@@ -92,16 +92,19 @@ def prepare(description: str) -> None:
 
 
 def fork_orphan() -> int:
-    """Fork a process whose parent is not us: 0 in the new one, its id in ours."""
+    """Fork a process whose parent is not us, with a session of its own: 0 in the new one, its id in ours."""
     ours, theirs = os.pipe()
     between = os.fork()
     if between == 0:
         between = os.getpid()
-        orphan = os.fork()
+        try:
+            orphan = os.fork()
+        except OSError:
+            os._exit(1)
         if orphan:
-            os.setpgid(orphan, orphan)  # before anybody is told, who might signal the group
-            os.write(theirs, str(orphan).encode())
             os._exit(0)
+        os.setsid()  # before anybody is told, who might signal the group
+        os.write(theirs, str(os.getpid()).encode())
         while os.getppid() == between:  # until we are adopted
             time.sleep(0.001)
         os.close(ours)
