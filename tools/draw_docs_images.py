@@ -42,7 +42,6 @@ def report_of(walk: Path, folder: Path) -> Path:
     run("-m", "limbloc_ros", "process", walk / "rgb", "--rig", walk / "calib.json", "--leave-out", str(empty),
         "--temporal", "--config", config, "--out", out)  # fmt: skip
     run("-m", "limbloc_ros", "report", out, "--reference", walk / "gt.npz")
-    run("tools/draw_overlay.py", out, "--frame", "20", "--out", IMAGES / "rgb_walk_overlay.jpg")
     return out / "report"
 
 
