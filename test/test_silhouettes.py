@@ -115,6 +115,18 @@ def test_cleaning_reads_any_number_as_foreground_and_keeps_its_input():
     assert not cleaned(np.zeros((30, 30), np.uint8)).any()
 
 
+def test_small_masks_keep_their_lone_pixels():
+    """Beside 99 px (98.5 as its contour gives it) a pixel is no speck; beside 130 it is."""
+    for rows, kept in ((9, True), (13, False)):
+        mask = np.zeros((30, 30), np.uint8)
+        mask[2 : 2 + rows, 2 : 13 if kept else 12] = 1
+        mask[20, 20] = 1
+        assert cleaned(mask)[20, 20] == kept
+    lone = np.zeros((9, 9), np.uint8)
+    lone[4, 4] = lone[7, 7] = 255
+    assert cleaned(lone).sum() == 2
+
+
 def test_cleaning_noise_against_labelled_regions():
     """Specks that hold nothing else are what connected components of few pixels are, by another algorithm."""
     rng = np.random.default_rng(3)

@@ -21,6 +21,9 @@ from limbloc_ros.core.lens import lens_range
 
 #: Coarsest blocks of the hierarchy, in voxels; halved until they are leaves.
 ROOT = 32
+#: A blob is a speck when the largest one has so many times its area; a lone pixel's area, as contours give it.
+SMALL_BLOB, LONE_AREA = 200.0, 0.5
+_NEIGHBOURS = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], np.uint8)
 
 
 @dataclass(frozen=True)
@@ -218,23 +221,32 @@ def cleaned(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
 def _cleaned_piece(mask: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], int, int]:
     """The part of the cleaned mask that holds all its foreground, and its first column and row."""
     x, y, width, height = cv2.boundingRect(mask)
-    piece = np.not_equal(mask[y : y + height, x : x + width], 0).view(np.uint8)
     if width == 0:
-        return piece, x, y
+        return np.zeros((0, 0), np.uint8), x, y
+    every = np.not_equal(mask[y : y + height, x : x + width], 0).view(np.uint8)
+    # Most specks are lone pixels: dropped at once, where the largest blob is large enough, which nearly always is so.
+    rest, left, top = _outlined(every & np.asarray(cv2.dilate(every, _NEIGHBOURS), np.uint8), x, y)
+    if rest.size and _drop_small(rest) > SMALL_BLOB * LONE_AREA:
+        return rest, left, top
+    _drop_small(every)
+    return every, x, y
+
+
+def _drop_small(piece: NDArray[np.uint8]) -> float:
+    """In place: blobs and holes that are far too small beside the largest blob go; its area, px."""
     contours, hierarchy = cv2.findContours(piece, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
-    if len(contours) > 1:
-        # A contour runs through the centres of its pixels: half its length more is the area of the pixels themselves,
-        # half its length less that of the hole it surrounds.
-        outer = hierarchy[0, :, 3] < 0
-        half_length = np.array([0.5 * len(contour) for contour in contours])
-        area = np.array([cv2.contourArea(contour) for contour in contours]) + np.where(outer, 1, -1) * half_length
-        largest = float(area[outer].max())
-        # One by one, for those that touch must not cancel out; only the one, for OpenCV copies the list it is given.
-        for i in map(int, np.flatnonzero(outer & (area < 0.005 * largest))):
-            cv2.drawContours(piece, [contours[i]], 0, 0, cv2.FILLED)
-        for i in map(int, np.flatnonzero(~outer & (area < 0.015 * largest))):
-            cv2.drawContours(piece, [contours[i]], 0, 1, cv2.FILLED)
-    return piece, x, y
+    # A contour runs through the centres of its pixels: half its length more is the area of the pixels themselves,
+    # half its length less that of the hole it surrounds.
+    outer = hierarchy[0, :, 3] < 0
+    half_length = np.array([0.5 * len(contour) for contour in contours])
+    area = np.array([cv2.contourArea(contour) for contour in contours]) + np.where(outer, 1, -1) * half_length
+    largest = float(area[outer].max())
+    # One by one, for those that touch must not cancel out; only the one, for OpenCV copies the list it is given.
+    for i in map(int, np.flatnonzero(outer & (area < largest / SMALL_BLOB))):
+        cv2.drawContours(piece, [contours[i]], 0, 0, cv2.FILLED)
+    for i in map(int, np.flatnonzero(~outer & (area < 0.015 * largest))):
+        cv2.drawContours(piece, [contours[i]], 0, 1, cv2.FILLED)
+    return largest
 
 
 def pack_cameras(rig: Rig) -> NDArray[np.float64]:
