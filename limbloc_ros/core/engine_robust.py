@@ -23,12 +23,16 @@ Refined = lm.LmResult[FigureState]
 Rivals = tuple[tuple[FigureState, float], ...]
 
 
+USUAL_TORSOS = search.TorsoSearch()
+
+
 @dataclass(frozen=True)
 class Effort:
     """How much is searched; the defaults are for one frame alone.
 
     Attributes:
         torsos: torso hypotheses, each tried with both facings.
+        torso_search: how they are found.
         leg_pairs: pairs of legs tried on each.
         starts: figures with legs and arms, of all these, that are refined.
         survivors, repaired: of these, so many are refined further, and so many get their limbs looked for again ...
@@ -47,6 +51,7 @@ class Effort:
     """
 
     torsos: int = 4
+    torso_search: search.TorsoSearch = USUAL_TORSOS
     leg_pairs: int = 3
     starts: int = 10
     survivors: int = 4
@@ -63,7 +68,7 @@ class Effort:
     points: int = 1000
     iterations: tuple[int, int, int, int, int] = (3, 5, 6, 4, 12)
     lenient_limits: float = 3e-3
-    enough: float = 5e-4
+    enough: float = 3.4e-4
     certain: float = 0.0
     dressed: bool = False
 
@@ -79,8 +84,13 @@ QUICK = Effort(
     torsos=2, leg_pairs=2, starts=4, survivors=2, arm_repairs=2, strict=2, single_arms=2, single_legs=1, rounds=1,
     finalists=1, candidates=40, enough=2e-4, certain=1.6e-4,
 )  # fmt: skip
-HARDER = Effort(torsos=14, leg_pairs=4, starts=24, survivors=8, repaired=3, enough=0.0, dressed=True)
+HARDER = Effort(
+    torsos=14, torso_search=search.TorsoSearch(headings=8, listed=1500, climbed=30), leg_pairs=4, starts=24,
+    survivors=8, repaired=3, finalists=5, enough=0.0, dressed=True,
+)  # fmt: skip
 SEARCHES = (QUICK, Effort(), HARDER)
+#: Torsos of one hull that differ and are worth a try.
+MOST_TORSOS = 14
 #: Figures of up to so many times the least energy are rivals.
 RIVAL_COST = 1.5
 
@@ -262,16 +272,13 @@ def fit_from_scratch(
         the fit of lowest energy, or None when no torso fits into the hull.
     """
     medial = Medial.of(hull)
-    most = max(effort.torsos for effort in searches)
-    torsos = [
-        facing
-        for torso, _ in search.torso_hypotheses(hull, medial, np.random.default_rng(seed), most)
-        for facing in (torso, search.turned_about(torso))
-    ]
-    if not torsos:
-        return None
+    torsos: list[FigureState] = []
     best: Fit | None = None
-    for effort in searches:
+    for n, effort in enumerate(searches):
+        if n == 0 or effort.torso_search != searches[n - 1].torso_search:
+            torsos = _torsos(hull, medial, seed, effort.torso_search)
+        if not torsos:
+            return best
         scene = make_scene(hull, medial, surface, seed, weights or Weights(), effort)
         some = torsos[: 2 * effort.torsos]
         if best is not None and effort.dressed:
@@ -284,6 +291,12 @@ def fit_from_scratch(
         if best.judged < effort.enough:
             break
     return best
+
+
+def _torsos(hull: Hull, medial: Medial, seed: int, effort: search.TorsoSearch) -> list[FigureState]:
+    """Torso hypotheses, the best first, each with both facings."""
+    found = search.torso_hypotheses(hull, medial, np.random.default_rng(seed), MOST_TORSOS, effort)
+    return [facing for torso, _ in found for facing in (torso, search.turned_about(torso))]
 
 
 def _judged(fit: Refined, scene: Scene) -> float:

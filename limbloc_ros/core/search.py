@@ -111,16 +111,39 @@ class Medial:
         return Medial(kernels.medial_ridge(sdf, hull.origin_m, hull.voxel_m, 0.15 * hull.voxel_m, 0.65))
 
 
+@dataclass(frozen=True)
+class TorsoSearch:
+    """How much is searched for torsos.
+
+    Attributes:
+        headings: tried for each pair of pelvis and skull, over half a turn.
+        listed: best torsos that are kept of all pairs.
+        climbed, steps: so many different ones of these climb on, with so many random steps.
+    """
+
+    headings: int = 6
+    listed: int = 400
+    climbed: int = 14
+    steps: int = 240
+
+
 def torso_hypotheses(
-    hull: Hull, medial: Medial, rng: np.random.Generator, keep: int = 6
+    hull: Hull, medial: Medial, rng: np.random.Generator, keep: int = 6, effort: TorsoSearch | None = None
 ) -> list[tuple[FigureState, float]]:
     """Torsos that fit the hull, the best first, without limbs; each stands for both of its facings.
 
     Brute force over pairs of medial points (pelvis, skull) x bends x headings, then hill climbing of the best.
 
+    Args:
+        hull, medial: the volume.
+        rng: of the hill climbing.
+        keep: most torsos to return.
+        effort: how much is searched.
+
     Returns:
         states with resting limbs and their scores (0 perfect, 1 useless).
     """
+    effort = effort or TorsoSearch()
     table = _torso_table()
     points = medial.points
     if len(points) == 0:
@@ -128,20 +151,20 @@ def torso_hypotheses(
     by_depth = np.argsort(-points[:, 3], kind="stable")
     trunk = by_depth[points[by_depth, 3] > max(0.04, 0.4 * points[:, 3].max())]
     pelvis = points[kernels.spread_out(points, trunk, 0.07, 40)]
-    heads = by_depth[(points[by_depth, 3] > 0.045) & (points[by_depth, 3] < 0.16)]
+    heads = by_depth[(points[by_depth, 3] > 0.03) & (points[by_depth, 3] < 0.16)]
     skull = points[kernels.spread_out(points, heads, 0.05, 90)]
     evidence = (hull.sdf, hull.origin_m, hull.voxel_m)
     found = torso_kernels.torso_from_pairs(
-        pelvis, skull, table.axis_base, table.axis_tip, table.bends, 6, 0.30, 0.95,
-        *evidence, table.arrays, table.weights, table.n_solid, 400,
+        pelvis, skull, table.axis_base, table.axis_tip, table.bends, effort.headings, 0.30, 0.95,
+        *evidence, table.arrays, table.weights, table.n_solid, effort.listed,
     )  # fmt: skip
     if len(found) == 0:
         return []
     found = found[np.argsort(found[:, 13], kind="stable")]
     spread = np.array([0.02] * 3 + [0.15] * 3 + [0.15] * 3 + [0.15] * 3 + [0.04])
     climbed = []
-    for start in _distinct(found, 14, 0.10, 0.4):
-        noise = rng.standard_normal((120, 13))
+    for start in _distinct(found, effort.climbed, 0.10, 0.4):
+        noise = rng.standard_normal((effort.steps, 13))
         climbed.append(
             torso_kernels.climb_torso(start, noise, *evidence, table.arrays, table.weights, table.n_solid, spread)
         )
