@@ -41,12 +41,12 @@ class PixelCounts:
 
     @staticmethod
     def of(pieces: Iterable[tuple[NDArray[np.uint8], int, int]]) -> PixelCounts:
-        """Count the ones of pieces [height, width] of 0 and 1 of every image, each with its first column and row."""
+        """Count the ones of the smallest piece [height, width] around them of every image; its first column and row."""
         parts = []
-        for piece, left, top in pieces:
-            x, y, width, height = cv2.boundingRect(piece) if piece.size else (0, 0, 0, 0)
-            sums = cv2.integral(piece[y : y + height, x : x + width]).ravel() if width else np.zeros(0, np.int32)
-            parts.append(((left + x, top + y, width, height), sums))
+        for piece, x, y in pieces:
+            sums = cv2.integral(piece).ravel() if piece.size else np.zeros(0, np.int32)
+            height, width = piece.shape if piece.size else (0, 0)
+            parts.append(((x, y, width, height), sums))
         return PixelCounts._joined(parts)
 
     def pick(self, cameras: Iterable[int], replaced: Mapping[int, PixelCounts] | None = None) -> PixelCounts:
@@ -164,7 +164,7 @@ class Silhouettes:
                 gained.append((mask[:0], x, y))
                 continue
             was, _, _ = before.part_of_mask(c, x, x + width, y, y + height)
-            gained.append((np.greater(mask, was).view(np.uint8), x, y))
+            gained.append(_outlined(np.greater(mask, was).view(np.uint8), x, y))
         return PixelCounts.of(gained)
 
     def changes_since(self, before: Silhouettes) -> PixelCounts:
@@ -184,7 +184,7 @@ class Silhouettes:
             y0, y1 = max(y, y_old), min(y + height, y_old + height_old)
             old = np.full((height, width), self.margins[c] - 0.5, np.float32)
             old[y0 - y : y1 - y, x0 - x : x1 - x] = before.piece(c)[y0 - y_old : y1 - y_old, x0 - x_old : x1 - x_old]
-            changed.append((np.less(self.piece(c), old).view(np.uint8), x, y))
+            changed.append(_outlined(np.less(self.piece(c), old).view(np.uint8), x, y))
         return PixelCounts.of(changed)
 
 
