@@ -253,7 +253,7 @@ def figure_png(figure: Figure) -> bytes:
 
 def image_png(bgr: np.ndarray) -> bytes:
     """A uint8 bgr image as PNG."""
-    done, data = cv2.imencode(".png", bgr, [cv2.IMWRITE_PNG_COMPRESSION, 9])
+    done, data = cv2.imencode(".png", bgr, [cv2.IMWRITE_PNG_COMPRESSION, 7])
     if not done:
         raise InputError(f"an image of shape {bgr.shape} cannot be encoded as PNG")
     return bytes(data)
