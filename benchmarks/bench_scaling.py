@@ -294,10 +294,8 @@ def search_limit_ms(rates: Rates) -> float:
 
 
 def memory() -> None:
-    """Peak resident memory of offline runs: the largest that each of their processes ever had, looked at 20 times a s."""
-    print(
-        f"\n| limbloc process {CASE.name} | processes | largest resident set, MB | all together, MB |\n|---|---|---|---|"
-    )
+    """Peak resident memory of offline runs: the largest that each of their processes ever had."""
+    print(f"\n| limbloc process {CASE.name} | processes | largest resident set, MB | sum, MB |\n|---|---|---|---|")
     for options in (["--jobs", "1"], ["--temporal"], ["--jobs", "2"]):
         peaks: dict[int, float] = {}
         with tempfile.TemporaryDirectory() as folder:
