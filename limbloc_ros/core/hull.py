@@ -120,6 +120,8 @@ class Hull:
         """
         if len(indices) == 0 or len(indices) != len(values):
             raise InputError(f"a hull needs as many signed distances as voxels and at least one, got {len(values)}")
+        # Whatever a message's arrays are like: the kernels are compiled for one kind, not again in the first frame.
+        indices, values = np.require(indices, np.int32, ["C", "W"]), np.require(values, np.float32, ["C", "W"])
         low, high = kernels.index_range(indices)
         low -= 1
         shape = tuple(int(n) for n in high - low + 2)
@@ -132,7 +134,7 @@ class Hull:
         if cut_by is None or viewpoints is None:
             return hull
         grid = np.full(shape, NOBODY, np.uint8)
-        kernels.fill_grid(grid, indices, low, cut_by)
+        kernels.fill_grid(grid, indices, low, np.require(cut_by, np.uint8, ["C", "W"]))
         return replace(hull, cut_by=grid, viewpoints=viewpoints)
 
 
