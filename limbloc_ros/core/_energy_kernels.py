@@ -74,7 +74,7 @@ def blended_sphere(w: Any, part: Any, spheres: Any, radii: Any) -> tuple[float, 
     return x, y, z, r
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def inclusion_term(
     samples: Any,
     sample_parts: Any,
@@ -111,7 +111,7 @@ def inclusion_term(
     return cost
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def gather(blocks: Any, slopes: Any, parts: Any, J: Any, A: Any, g: Any) -> None:
     """Multiply the parts' blocks by the figure's Jacobian [S, 4, P] and add them to A [P, P] and g [P].
 
@@ -157,7 +157,7 @@ def gather(blocks: Any, slopes: Any, parts: Any, J: Any, A: Any, g: Any) -> None
             A[i, j] = A[j, i]
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def penetration_term(
     pairs: Any,
     parts: Any,
@@ -222,7 +222,7 @@ def penetration_term(
     return cost
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def turn_derivative(w: Any, out: Any) -> None:
     """How the rotation vector w of a rotation changes with a small turn after it: inverse right Jacobian of SO(3)."""
     t2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
@@ -243,7 +243,7 @@ def turn_derivative(w: Any, out: Any) -> None:
     out[2, 1] += 0.5 * w[0]
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def posture_term(
     rotations: Any,
     shape: Any,
@@ -342,7 +342,7 @@ def posture_term(
     return cost  # type: ignore[no-any-return]
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def xor_counts(sdf: Any, origin: Any, voxel: float, parts: Any, spheres: Any, radii: Any) -> tuple[int, int, int]:
     """Voxels inside the hull only, inside the flesh only (anywhere in the world), and inside the hull (eq. 2).
 

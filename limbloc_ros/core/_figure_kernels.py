@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def exp_so3(w: Any) -> Any:
     """Rotation vector [3], rad -> rotation matrix [3, 3] (Rodrigues)."""
     t2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
@@ -34,7 +34,7 @@ def exp_so3(w: Any) -> Any:
     return R
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def log_so3(R: Any) -> Any:
     """Rotation matrix [3, 3] -> rotation vector [3], rad, of length at most pi."""
     # Through the unit quaternion with the largest component first: exact near 0 and near pi.
@@ -67,7 +67,7 @@ def log_so3(R: Any) -> Any:
     return (2.0 * math.atan2(n, q[0]) / n) * q[1:4]
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def forward(
     root: Any,
     rotations: Any,
@@ -143,7 +143,7 @@ def forward(
     return origins, world, points, radii
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def jacobian(
     origins: Any,
     world: Any,
@@ -247,7 +247,7 @@ def _segment(px: float, py: float, pz: float, a: Any, ra: float, b: Any, rb: flo
     return math.sqrt(ex * ex + ey * ey + ez * ez) - (ra + t * dr), t
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def part_distance(px: float, py: float, pz: float, part: Any, points: Any, radii: Any, weights: Any) -> float:
     """Signed distance (m) of a point to one part: the convex hull of its (up to three) spheres.
 
@@ -330,7 +330,7 @@ def part_distance(px: float, py: float, pz: float, part: Any, points: Any, radii
     return best  # type: ignore[no-any-return]
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def part_bounds(parts: Any, points: Any, radii: Any) -> Any:
     """[P, 4] a sphere (x, y, z, radius) around each part."""
     out = np.empty((len(parts), 4))
@@ -348,7 +348,7 @@ def part_bounds(parts: Any, points: Any, radii: Any) -> Any:
     return out
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def flesh_distance(query: Any, parts: Any, points: Any, radii: Any) -> Any:
     """Signed distance [Q] (m) of points [Q, 3] to the union of the parts, and the nearest part [Q].
 
@@ -376,7 +376,7 @@ def flesh_distance(query: Any, parts: Any, points: Any, radii: Any) -> Any:
     return out, nearest
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def turned(rotations: Any, angles: Any, dof_bones: Any, dof_axes: Any) -> Any:
     """Each bone's rotation [B, 3, 3] followed by the rotation vector of its degrees of freedom (rad)."""
     out = rotations.copy()

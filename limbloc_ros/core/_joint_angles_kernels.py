@@ -14,25 +14,25 @@ from limbloc_ros.core._figure_kernels import exp_so3
 TURN = 2.0 * math.pi
 
 
-@njit(cache=True)  # type: ignore[misc, unused-ignore]
+@njit(cache=True, nogil=True)  # type: ignore[misc, unused-ignore]
 def cross(a: Any, b: Any) -> Any:
     """a x b."""
     return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 
-@njit(cache=True)  # type: ignore[misc, unused-ignore]
+@njit(cache=True, nogil=True)  # type: ignore[misc, unused-ignore]
 def dot(a: Any, b: Any) -> Any:
     """a . b, summed in a fixed order."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@njit(cache=True)  # type: ignore[misc, unused-ignore]
+@njit(cache=True, nogil=True)  # type: ignore[misc, unused-ignore]
 def apply(R: Any, v: Any) -> Any:
     """R v."""
     return np.array([dot(R[0], v), dot(R[1], v), dot(R[2], v)])
 
 
-@njit(cache=True)  # type: ignore[misc, unused-ignore]
+@njit(cache=True, nogil=True)  # type: ignore[misc, unused-ignore]
 def other_two(R: Any, axes: Any, q1: float) -> Any:
     """The second and third angle that come nearest to R once the first is chosen."""
     first, second, third = axes[0], axes[1], axes[2]
@@ -44,7 +44,7 @@ def other_two(R: Any, axes: Any, q1: float) -> Any:
     return q2, math.atan2(dot(third, cross(second, u)), dot(second, u))
 
 
-@njit(cache=True)  # type: ignore[misc, unused-ignore]
+@njit(cache=True, nogil=True)  # type: ignore[misc, unused-ignore]
 def wound(angle: float, start: float, low: float, high: float) -> float:
     """`angle` plus whole turns, nearest to `start`; but near its range, so that turns do not add up over time."""
     near = angle + TURN * round((start - angle) / TURN)
@@ -54,7 +54,7 @@ def wound(angle: float, start: float, low: float, high: float) -> float:
     return angle + TURN * round((middle - angle) / TURN)
 
 
-@njit(cache=True)  # type: ignore[misc, unused-ignore]
+@njit(cache=True, nogil=True)  # type: ignore[misc, unused-ignore]
 def triple(R: Any, axes: Any, low: Any, high: Any, previous: Any, follow: bool, slack: float, stray: float) -> Any:
     """The angles [3] of a rotation; `previous` counts only if `follow`. Infinite limits: round and round."""
     first, second, third = axes[0], axes[1], axes[2]

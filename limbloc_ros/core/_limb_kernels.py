@@ -16,7 +16,7 @@ from limbloc_ros.core._surface_fit_kernels import distance_to_part, lay_out
 EATEN = 0.4
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def tube_score(
     sdf: Any,
     origin: Any,
@@ -55,7 +55,7 @@ def tube_score(
     return total / (steps * clip * clip)
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def explained_grid(sdf: Any, origin: Any, voxel: float, stride: int, parts: Any, spheres: Any, radii: Any) -> Any:
     """How far each cell of `stride` voxels lies inside the given parts: 0 outside, 1 from 5 cm depth on; float32."""
     nx = (sdf.shape[0] + stride - 1) // stride
@@ -88,7 +88,7 @@ def explained_grid(sdf: Any, origin: Any, voxel: float, stride: int, parts: Any,
     return out
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def explained_fraction(
     grid: Any, origin: Any, cell: float, ax: float, ay: float, az: float, bx: float, by: float, bz: float, skip: float
 ) -> float:
@@ -104,7 +104,7 @@ def explained_fraction(
     return total / 4
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def search_limb(
     base: Any,
     lengths: Any,

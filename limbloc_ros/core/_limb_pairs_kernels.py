@@ -17,7 +17,7 @@ from limbloc_ros.core._surface_fit_kernels import lay_out, nearest_part, offset_
 MOST_FOR_LIMITS = 5e-5
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def limb_turns(upper: Any, lower: Any, parent: Any, rest: Any, sign: float, first: Any, second: Any) -> float:
     """World rotations of a limb's two bones that lie along `upper` and `lower` (unit); returns the flexion, rad.
 
@@ -60,7 +60,7 @@ def limb_turns(upper: Any, lower: Any, parent: Any, rest: Any, sign: float, firs
     return flexion
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def limb_fits(
     found: Any,
     base: Any,
@@ -206,7 +206,7 @@ def limb_fits(
         own[m] = cost + min(limits, MOST_FOR_LIMITS)
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def body_fit(query: Any, normals: Any, rays: Any, parts: Any, spheres: Any, radii: Any, surface: Any) -> Any:
     """How well the given parts explain each point: gated distance [Q], m, and cost [Q], m^2; see `limb_fits`."""
     rows, bounds = lay_out(parts, spheres, radii)
@@ -224,7 +224,7 @@ def body_fit(query: Any, normals: Any, rays: Any, parts: Any, spheres: Any, radi
     return gaps, costs
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def best_alone(gaps: Any, costs: Any, own: Any, body_costs: Any, point_weight: float, keep: int) -> Any:
     """Rows of the candidates that lower the energy most when the other limb is missing, the best first."""
     total = np.empty(len(own))
@@ -236,7 +236,7 @@ def best_alone(gaps: Any, costs: Any, own: Any, body_costs: Any, point_weight: f
     return np.argsort(total)[:keep]
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def best_pairs(
     left: Any,
     right: Any,

@@ -30,7 +30,7 @@ def depth_at(sdf: Any, origin: Any, voxel: float, x: float, y: float, z: float) 
     return v0 + a * (v1 - v0)  # type: ignore[no-any-return]
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def medial_ridge(sdf: Any, origin: Any, voxel: float, least_depth: float, flat: float) -> Any:
     """Voxels of the medial axis: inside, and the signed distance has no clear slope (|gradient| < flat).
 
@@ -58,7 +58,7 @@ def medial_ridge(sdf: Any, origin: Any, voxel: float, least_depth: float, flat: 
     return out[:count]
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def spread_out(points: Any, order: Any, apart: float, most: int) -> Any:
     """Indices of points taken in `order`, each at least `apart` (m) from those before, `most` of them."""
     out = np.empty(most, np.int64)

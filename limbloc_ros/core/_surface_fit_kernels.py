@@ -22,7 +22,7 @@ def robust_weight(d: float, width: float) -> tuple[float, float]:
     return width * width * u / (1.0 + u), 1.0 / ((1.0 + u) * (1.0 + u))
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def add_block(block: Any, slope: Any, w: Any, away: Any, residual: float, weight: float) -> None:
     """Add one residual to a part's block (on and above the diagonal of its 4 x 4 pieces) and slope.
 
@@ -43,7 +43,7 @@ def add_block(block: Any, slope: Any, w: Any, away: Any, residual: float, weight
                     block[4 * k + i, 4 * m + j] += both * away[j]
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def lay_out(parts: Any, spheres: Any, radii: Any) -> tuple[Any, Any]:
     """What `nearest_part` reads of the parts, each number where it is needed next.
 
@@ -80,7 +80,7 @@ def _on_edge(qq: float, qd: float, dd: float, r: float, dr: float) -> tuple[floa
     return math.sqrt(max(qq - 2.0 * t * qd + t * t * dd, 0.0)) - (r + t * dr), t
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def distance_to_part(row: Any, x: float, y: float, z: float, ray: Any) -> tuple[float, float, float]:
     """Signed distance of a point, or of a ray through it, to a part of `lay_out`; weights of its 2nd and 3rd sphere.
 
@@ -138,7 +138,7 @@ def distance_to_part(row: Any, x: float, y: float, z: float, ray: Any) -> tuple[
     return best, wb, wc
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def nearest_part(
     point: Any, normal: Any, ray: Any, rows: Any, bounds: Any, gate: float, within: float, hint: int, far: Any, w: Any
 ) -> tuple[float, int]:
@@ -182,7 +182,7 @@ def nearest_part(
     return best, best_part
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def radius_slope(ray: Any, part: Any, spheres: Any, radii: Any, out: Any) -> None:
     """Minus the gradient of the radius over the triangle of a part's spheres, seen along a ray; [3]; 0 on a line."""
     u = np.empty(3)
@@ -236,7 +236,7 @@ def offset_from(point: Any, ray: Any, part: Any, w: Any, spheres: Any, radii: An
     return length - r
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def surface_term(
     query: Any,
     normals: Any,

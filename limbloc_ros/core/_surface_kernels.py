@@ -18,7 +18,7 @@ OFFSETS: Ints = np.array(
 )
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def list_surface(sdf: NDArray[np.float32]) -> tuple[Ints, Ints]:
     """Inside voxels with an outside face neighbour: local indices [N, 3]; grid of their numbers (-1 elsewhere)."""
     nx, ny, nz = sdf.shape
@@ -52,7 +52,7 @@ def list_surface(sdf: NDArray[np.float32]) -> tuple[Ints, Ints]:
     return local, number
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def list_neighbours(indices: Ints, offsets: Ints) -> Ints:
     """[N, 26] rows of the voxels around each voxel of the list, -1 where there is none."""
     low = np.array([indices[:, a].min() - 1 for a in range(3)])
@@ -68,7 +68,7 @@ def list_neighbours(indices: Ints, offsets: Ints) -> Ints:
     return out
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def largest_component(local: Ints, number: Ints, offsets: Ints) -> Ints:
     """The listed voxels [M, 3] of the largest connected piece, in the same order."""
     nx, ny, nz = number.shape
@@ -100,7 +100,7 @@ def largest_component(local: Ints, number: Ints, offsets: Ints) -> Ints:
     return local if labels == 1 else local[label == best]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def sobel_at(volume: NDArray[np.float32], local: Ints) -> Array:
     """Gradient [N, 3] by the paper's eq. 1 (centred 3x3x3 Sobel), edges repeated; 32 times the change per voxel."""
     nx, ny, nz = volume.shape
@@ -122,7 +122,7 @@ def sobel_at(volume: NDArray[np.float32], local: Ints) -> Array:
     return out
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def normalise_outward(gradient: Array, sdf: NDArray[np.float32], local: Ints) -> Array:
     """Unit normals [N, 3]; where the gradient vanishes (a sheet one voxel thick) the first open face decides."""
     nx, ny, nz = sdf.shape
@@ -150,7 +150,7 @@ def normalise_outward(gradient: Array, sdf: NDArray[np.float32], local: Ints) ->
     return out
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def trilinear(volume: NDArray[np.float32], x: float, y: float, z: float) -> float:
     """Value at the local grid position (x, y, z), where integers are voxel centres; clamped to the grid."""
     nx, ny, nz = volume.shape
@@ -169,7 +169,7 @@ def trilinear(volume: NDArray[np.float32], x: float, y: float, z: float) -> floa
     return float((1 - c) * low + c * high)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def crossing_along_normal(sdf: NDArray[np.float32], local: Ints, normals: Array, reach: float) -> Array:
     """Steps [N] in voxels from each voxel centre along its normal to sdf = 0.
 
@@ -205,7 +205,7 @@ def crossing_along_normal(sdf: NDArray[np.float32], local: Ints, normals: Array,
     return out
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def mean_neighbour_angle(normals: Array, neighbours: Ints) -> Array:
     """Mean angle [N] rad between a voxel's normal and those of its surface neighbours; 0 where there are none."""
     out = np.zeros(normals.shape[0])
@@ -222,7 +222,7 @@ def mean_neighbour_angle(normals: Array, neighbours: Ints) -> Array:
     return out
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def spread_in_ball(values: Array, points: Array, neighbours: Ints, radius: float) -> tuple[Array, Array]:
     """Mean and standard deviation [N] of `values` over the surface patch within `radius` of each point.
 

@@ -26,7 +26,7 @@ def misfit(phi: float, radius: float, solid: bool, clip: float) -> float:
     return e * e
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def torso_score(
     sdf: Any, origin: Any, voxel: float, points: Any, radii: Any, weights: Any, n_solid: int, clip: float
 ) -> float:
@@ -42,7 +42,7 @@ def torso_score(
     return total / (weights.sum() * clip * clip)  # type: ignore[no-any-return]
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def place_torso(
     pose: Any, parents: Any, bone_offsets: Any, point_bones: Any, point_offsets: Any, point_radii: Any
 ) -> Any:
@@ -69,7 +69,7 @@ def place_torso(
     return points, radii
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def torso_from_pairs(
     pelvis_seeds: Any,
     head_seeds: Any,
@@ -194,7 +194,7 @@ def torso_from_pairs(
     return out[:count]
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def climb_torso(
     start: Any, noise: Any, sdf: Any, origin: Any, voxel: float, table: Any, weights: Any, n_solid: int, spread: Any
 ) -> Any:

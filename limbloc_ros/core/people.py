@@ -23,8 +23,11 @@ with a `max_people` of 1.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -247,6 +250,7 @@ class People:
     def _follow_many(self, sight: Sight, stamp_ns: int) -> list[_Track]:
         taken: list[_Track] = []
         newcomers: list[tuple[_Track, int]] = []
+        fits: list[tuple[_Track, Callable[[], Pose | NoPerson]]] = []
         found = self._assign(sight.parts, stamp_ns)
         for n, part in enumerate(sight.parts):
             claimants = [track for track, m in found if m == n]
@@ -263,7 +267,7 @@ class People:
                     self._alone = track  # the largest part in a room in which nobody is known
                 taken.append(track)
                 if track is self._alone or track.number or (track.looked_ns is not None and track.score > FURNITURE):
-                    track.judge(stamp_ns, sight.fit(n, track.estimator))
+                    fits.append((track, partial(sight.fit, n, track.estimator)))
                 elif not track.rests(stamp_ns):
                     newcomers.append((track, n))
                 continue
@@ -276,12 +280,14 @@ class People:
                     track.seen_ns, track.shared = stamp_ns, True
                     continue
                 track.see(Part.of(piece), stamp_ns, shared=True)
-                track.judge(stamp_ns, track.estimator.estimate(piece))
+                fits.append((track, partial(track.estimator.estimate, piece)))
         # Fits from scratch take as long as many followed frames: one newcomer in each frame, who has waited longest.
         newcomers.sort(key=lambda entry: entry[0].looked_ns or 0)
         for track, n in newcomers[: 1 if self.config.temporal else None]:
             track.estimator.reset()  # what has led astray is of no use
-            track.judge(stamp_ns, sight.fit(n, track.estimator))
+            fits.append((track, partial(sight.fit, n, track.estimator)))
+        for (track, _), outcome in zip(fits, _side_by_side([fit for _, fit in fits]), strict=True):
+            track.judge(stamp_ns, outcome)
         return taken
 
     def _begin(self, part: Part, stamp_ns: int) -> _Track:
@@ -369,6 +375,14 @@ class People:
             self._alone = None if snapshot["alone"] is None else self._tracks[snapshot["alone"]]
         except (KeyError, TypeError, ValueError, IndexError) as error:
             raise InputError(f"what is kept of the people of an unfinished run is damaged ({error!r})") from None
+
+
+def _side_by_side(fits: Sequence[Callable[[], Pose | NoPerson]]) -> list[Pose | NoPerson]:
+    """Fit several people at the same time: kernels leave the interpreter to others, and no fit depends on another."""
+    if len(fits) < 2:
+        return [fit() for fit in fits]
+    with ThreadPoolExecutor(min(len(fits), os.cpu_count() or 1)) as pool:
+        return list(pool.map(lambda fit: fit(), fits))
 
 
 def _distance(track: _Track, stamp_ns: int) -> Callable[[Array], Array]:

@@ -43,7 +43,8 @@ class Tracker:
     DOUBT, DOUBTFUL_COST = 1.35, 4.5e-4
     #: ... but starting anew, which takes as long as many followed frames, is tried only every so many frames: in a
     #: live room a slow fit makes the next step longer. Limbs are checked as often. Each time that starting anew finds
-    #: nothing better, the wait doubles, up to this: some hulls are just bad.
+    #: nothing better, the wait doubles, up to this: some hulls are just bad. Only after a hopeless start the next
+    #: frame is tried.
     PATIENCE, LONGEST_WAIT = 8, 32
     #: What is searched when starting anew: less than for a frame alone, for the next frames can mend it.
     SEARCHES = (
@@ -108,7 +109,7 @@ class Tracker:
             self._last_scratch = self._frame
             scratch = fit_from_scratch(hull, surface, self._seed, self._weights, self._searches)
             if scratch is not None and (fit is None or scratch.judged < 0.95 * fit.judged):
-                fit, self._wait = scratch, self.PATIENCE
+                fit, self._wait = scratch, self.PATIENCE if scratch.judged < self.DOUBTFUL_COST else 1
                 self._size, self._sized = scratch.state.shape, 1
             else:
                 self._wait = min(2 * self._wait, self.LONGEST_WAIT)
