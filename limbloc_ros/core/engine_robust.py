@@ -85,7 +85,7 @@ QUICK = Effort(
     finalists=1, candidates=40, enough=2e-4, certain=1.6e-4,
 )  # fmt: skip
 HARDER = Effort(
-    torsos=14, torso_search=search.TorsoSearch(headings=8, listed=1500, climbed=30), leg_pairs=4, starts=24,
+    torsos=14, torso_search=search.TorsoSearch(headings=12, listed=3000, climbed=60, steps=480), leg_pairs=4, starts=24,
     survivors=8, repaired=3, finalists=5, enough=0.0, dressed=True,
 )  # fmt: skip
 SEARCHES = (QUICK, Effort(), HARDER)
