@@ -17,6 +17,7 @@ from limbloc_ros.core.silhouettes import (
     pack_cameras,
     signed_distance_px,
 )
+from limbloc_ros.simulation.ring import default_rig
 
 
 def exact_distance(mask):
@@ -168,6 +169,16 @@ def test_pieces_end_where_nothing_nearer_than_the_band_can_be_seen(x):
     assert margin <= 100 * 0.06 / (0.5 * nearest) + 4
     exact = exact_distance(silhouettes.whole_mask(0))[y0:, x0:][:height, :width]
     np.testing.assert_array_equal(silhouettes.piece(0), np.minimum(exact, silhouettes.margins[0] - 0.5))
+
+
+def test_wide_images_of_lenses_are_cut_as_well():
+    """At the corners of a 16:9 image some space is beyond what the lens's polynomial tells; it is not near for that."""
+    rig = default_rig(8, 640, 360)
+    mask = np.zeros((360, 640), np.uint8)
+    mask[120:240, 300:340] = 255
+    masks = {camera.name: mask for camera in rig.cameras}
+    silhouettes = measure_silhouettes(masks, rig, pack_cameras(rig), HullConfig())
+    assert silhouettes.margins.max() < 60
 
 
 def test_a_camera_in_the_volume_keeps_its_whole_image():

@@ -74,7 +74,8 @@ def view_of_balls(cams: Any, c: int, centres: Any, radius: float, count: int, vi
 
     Rows 0 and 1: the centre's pixel (u, v). Row 2: the nearest depth, m. Row 3: `reach` (px): every point of the ball
     is seen at most that far from (u, v). Row 4: UNSEEN or WITHIN the image wholly, PARTLY, or UNKNOWN; what the other
-    rows say of balls that are UNSEEN or UNKNOWN means nothing, but that the latter's depth is 0.
+    rows say of balls that are UNSEEN means nothing, nor where the UNKNOWN are seen; their depth is right, but 0 when
+    it is less than CLOSEST.
 
     A point that is d from the centre differs from it by at most d / nearest depth * sqrt(1 + a^2 + b^2) in normalised
     coordinates (a, b: those of the centre), and the lens enlarges that by a known factor at most.
@@ -110,7 +111,9 @@ def view_of_balls(cams: Any, c: int, centres: Any, radius: float, count: int, vi
         inmost = min(min(u, right - u), min(v, bottom - v))
         seen = WITHIN if inmost >= reach else PARTLY
         seen = UNSEEN if inmost < -reach else seen
-        views[2, n] = 0.0 if how == UNKNOWN else views[2, n]
+        # anew, for pixels beyond the lens have lost it
+        near = r20 * centres[0, n] + r21 * centres[1, n] + t2 + r22 * centres[2, n] - radius
+        views[2, n] = 0.0 if near < CLOSEST else near
         views[4, n] = seen if how == WITHIN else how
 
 

@@ -36,6 +36,8 @@ INNER_PX = 1.5
 DOUBTED_FRACTION = 0.02
 #: A part of the hull is a phantom when in all cameras but one less of what it covers is covered by it alone.
 PHANTOM_SHARE = 0.1
+#: A carve volume that ends below this height, m, ends at the floor.
+FLOOR_M = 0.5
 #: In `Hull.cut_by`: no camera decided here.
 NOBODY = 255
 
@@ -80,7 +82,7 @@ class Hull:
 
     @property
     def cut_area_m2(self) -> float:
-        """How much of the carve volume's walls and ceiling lies inside the hull, m^2: what is beyond was not carved.
+        """How much of the carve volume's sides lies inside the hull, m^2, but of the floor: what is beyond is unknown.
 
         Elsewhere the signed distance grows by no more than a voxel from voxel to voxel; there it jumps.
         """
@@ -88,7 +90,8 @@ class Hull:
         for axis in range(3):
             first, second, before, last = (np.take(self.sdf, i, axis=axis) for i in (0, 1, -2, -1))
             faces += int(np.count_nonzero((before < 0) & (last >= self.band_m)))
-            if axis < 2:  # people stand on the floor
+            above_floor = float(self.origin_m[2]) > FLOOR_M
+            if axis < 2 or above_floor:  # people stand and lie on the floor
                 faces += int(np.count_nonzero((second < 0) & (first >= self.band_m)))
         return float(faces) * self.voxel_m**2
 
