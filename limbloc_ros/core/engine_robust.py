@@ -81,8 +81,8 @@ JUDGED_CLOTHING = 2e-5
 #: One search after the other, until the energy is low: most figures are found easily, and of 170 frames whose first
 #: search ended below 2e-4 no harder one was right where that was wrong.
 QUICK = Effort(
-    torsos=2, leg_pairs=2, starts=4, survivors=2, arm_repairs=2, strict=2, single_arms=2, single_legs=1, rounds=1,
-    finalists=1, candidates=40, enough=2e-4, certain=1.6e-4,
+    torsos=2, leg_pairs=2, starts=3, survivors=2, arm_repairs=1, strict=2, single_arms=2, single_legs=1, rounds=1,
+    finalists=1, candidates=32, enough=2e-4, certain=1.6e-4,
 )  # fmt: skip
 HARDER = Effort(
     torsos=14, torso_search=search.TorsoSearch(headings=12, listed=3000, climbed=60, steps=480), leg_pairs=4, starts=24,
