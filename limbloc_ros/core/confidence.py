@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 Rivals = Sequence[tuple[FigureState, float]]
 
 #: XOR energy, smooth cost (m^2) and largest joint sigma (m) above which a pose is not to be acted on. Over the public
-#: and our own suites this catches three of four frames that fail, at 6 false alarms in 100 (see docs/benchmarks.md).
+#: suites this catches a third of the few frames that fail, at 4 false alarms in 100 (see docs/benchmarks.md).
 RELIABLE_XOR, RELIABLE_COST, RELIABLE_SIGMA = 0.62, 2.8e-4, 0.25
 #: Error that remains where nothing is in doubt, m; how far the energy's curvature is believed; by how much the energy
 #: of a rival (as a fraction of the least) may be above that before it hardly counts.
