@@ -12,7 +12,7 @@ below `humans/bodies/<id>`.
 
 Images are subscribed best effort, which every camera driver offers; everything we publish is reliable, because a
 reliable publisher also serves best-effort subscribers, RViz asks for reliable, and best-effort messages of some 100 KB
-are lost by an untuned Fast DDS (docs/how_to/network.md). The queues hold what comes during a slow moment of the node behind
+are lost by an untuned Fast DDS (config/fastdds.xml). The queues hold what comes during a slow moment of the node behind
 them; who stays behind skips whole frames and says so (`backlog`), so that nothing grows late without end.
 """
 
