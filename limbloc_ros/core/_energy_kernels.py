@@ -384,9 +384,10 @@ def xor_counts(sdf: Any, origin: Any, voxel: float, parts: Any, spheres: Any, ra
                 k = max(first[2], math.ceil(middle - half))
                 end = min(last[2], math.floor(middle + half))
                 within = 0 <= i < sdf.shape[0] and 0 <= j < sdf.shape[1]
+                column = filled[i - low[0], j - low[1]]
                 entered = False
                 while k <= end:
-                    if filled[i - low[0], j - low[1], k - low[2]]:
+                    if column[k - low[2]]:
                         k += 1
                         continue
                     d, _, _ = distance_to_part(rows[p], x, y, origin[2] + k * voxel, no_ray)
@@ -394,8 +395,8 @@ def xor_counts(sdf: Any, origin: Any, voxel: float, parts: Any, spheres: Any, ra
                     if d < 0.0:
                         entered = True
                         for m in range(k, min(k + steps, end + 1)):
-                            if not filled[i - low[0], j - low[1], m - low[2]]:
-                                filled[i - low[0], j - low[1], m - low[2]] = True
+                            if not column[m - low[2]]:
+                                column[m - low[2]] = True
                                 flesh += 1
                                 if within and 0 <= m < sdf.shape[2] and sdf[i, j, m] < 0.0:
                                     both += 1

@@ -90,8 +90,7 @@ class Hull:
         for axis in range(3):
             first, second, before, last = (np.take(self.sdf, i, axis=axis) for i in (0, 1, -2, -1))
             faces += int(np.count_nonzero((before < 0) & (last >= self.band_m)))
-            above_floor = float(self.origin_m[2]) > FLOOR_M
-            if axis < 2 or above_floor:  # people stand and lie on the floor
+            if axis < 2 or self.origin_m[2] > FLOOR_M:  # people stand and lie on the floor
                 faces += int(np.count_nonzero((second < 0) & (first >= self.band_m)))
         return float(faces) * self.voxel_m**2
 

@@ -23,7 +23,6 @@ with a `max_people` of 1.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -381,7 +380,7 @@ def _side_by_side(fits: Sequence[Callable[[], Pose | NoPerson]]) -> list[Pose | 
     """Fit several people at the same time: kernels leave the interpreter to others, and no fit depends on another."""
     if len(fits) < 2:
         return [fit() for fit in fits]
-    with ThreadPoolExecutor(min(len(fits), os.cpu_count() or 1)) as pool:
+    with ThreadPoolExecutor(len(fits)) as pool:
         return list(pool.map(lambda fit: fit(), fits))
 
 
