@@ -14,7 +14,6 @@ from motion_files import Gltf, read_bvh, read_c3d, read_ply
 from limbloc_ros import cli
 from limbloc_ros.core.errors import ConfigError, InputError, NoPerson
 from limbloc_ros.core.figure import FigureState, flesh_distance
-from limbloc_ros.core.files import replaced
 from limbloc_ros.core.pose import JOINT, JOINT_NAMES
 from limbloc_ros.export.bvh import bvh_text
 from limbloc_ros.export.clip import clip_of
@@ -23,6 +22,7 @@ from limbloc_ros.export.markers import MARKER_SETS, joints_of_markers, marker_pl
 from limbloc_ros.export.skeleton import ORIGINS, TIPS, skeleton_of
 from limbloc_ros.export.tables import csv_text
 from limbloc_ros.export.trc import read_trc, trc_text
+from limbloc_ros.files import replaced
 from limbloc_ros.recordings.cases import load_case
 from limbloc_ros.recordings.kept_frames import KeptFrames
 from limbloc_ros.recordings.results import FrameResult, Run

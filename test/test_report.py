@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from test_renderer import DISTORTED, RIG, ball_hull, person
 
-from limbloc_ros.core.errors import InputError, NoPerson
+from limbloc_ros.core.errors import InputError, NoPerson, OutputError
 from limbloc_ros.core.pose import JOINT, JOINT_NAMES, Flesh, Pose
 from limbloc_ros.recordings.results import FrameResult, Run
 from limbloc_ros.report import pictures, plots
@@ -243,5 +243,5 @@ def test_report_is_the_same_every_time(tmp_path):
 
 def test_report_into_a_file_says_so(tmp_path):
     (tmp_path / "taken").write_text("a file")
-    with pytest.raises(InputError, match=r"report cannot be written to .*taken"):
+    with pytest.raises(OutputError, match=r"taken.* cannot be written: File exists"):
         write_report(RunData.of(recorded(), title="t"), [], tmp_path / "taken")

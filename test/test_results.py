@@ -113,12 +113,12 @@ def test_nothing_is_lost_when_writing_fails(tmp_path):
     run = Run(tuple(make_frames()))
     run.save_joints(tmp_path / "joints.npz")
     before = (tmp_path / "joints.npz").read_bytes()
-    (tmp_path / ".joints.npz.writing").mkdir()  # as if the disk refused
+    (tmp_path / ".writing-joints.npz").mkdir()  # as if the disk refused
     with pytest.raises(OutputError, match=r"joints\.npz cannot be written: .*finished frames are kept"):
         run.save_joints(tmp_path / "joints.npz")
     assert (tmp_path / "joints.npz").read_bytes() == before
     (tmp_path / "file").write_text("")
-    with pytest.raises(OutputError, match="cannot be made"):
+    with pytest.raises(OutputError, match="cannot be written: Not a directory"):
         run.save(tmp_path / "file" / "out")
 
 

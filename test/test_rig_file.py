@@ -222,14 +222,14 @@ def test_missing_file_folder_and_binary(tmp_path):
 
 FULL_DISK = """
 import resource, signal, sys
-from limbloc_ros.core.errors import RigError
+from limbloc_ros.core.errors import OutputError
 from limbloc_ros.rig.rig_file import save_rig
 from limbloc_ros.simulation.room import default_rig
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (200, 200))
 try:
     save_rig(default_rig(8), sys.argv[1])
-except RigError as error:
+except OutputError as error:
     print(error)
 """
 

@@ -16,8 +16,9 @@ from geometry_msgs.msg import PoseArray
 from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException
 
-from limbloc_ros.core.files import write_text
 from limbloc_ros.core.pose import JOINT, LIMB_JOINTS, Array
+from limbloc_ros.files import write_text
+from limbloc_ros.recordings.results import stamp_text
 from limbloc_ros.ros import topics
 from limbloc_ros.ros.messages import message_to_joints, stamp_ns, status_values
 from limbloc_ros.ros.node_main import make_executor
@@ -139,7 +140,7 @@ class LiveTable:
         writer = csv.writer(text, lineterminator="\n")
         writer.writerow(["stamp_s", "latency_ms", "median_error_mm", "worst_error_mm"])
         for stamp, *values in self.rows:
-            writer.writerow([f"{stamp // 10**9}.{stamp % 10**9:09d}", *(f"{value:.3f}" for value in values)])
+            writer.writerow([stamp_text(stamp), *(f"{value:.3f}" for value in values)])
         write_text(path, text.getvalue())
 
 

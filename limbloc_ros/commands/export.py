@@ -13,7 +13,6 @@ import numpy as np
 from tqdm import tqdm
 
 from limbloc_ros.core.errors import ConfigError, InputError
-from limbloc_ros.core.files import replaced, write_text
 from limbloc_ros.export import bvh, c3d_file, trc
 from limbloc_ros.export.clip import Clip, clip_of
 from limbloc_ros.export.gltf import write_gltf
@@ -23,6 +22,7 @@ from limbloc_ros.export.recording import config_of, open_recording, rig_of
 from limbloc_ros.export.skeleton import LENGTHS, Skeleton, skeleton_of
 from limbloc_ros.export.tables import csv_text
 from limbloc_ros.export.video import CODECS, write_video
+from limbloc_ros.files import replaced, write_text
 from limbloc_ros.recordings.kept_frames import KeptFrames
 from limbloc_ros.recordings.results import Run
 

@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from limbloc_ros.core.camera import Rig
 from limbloc_ros.core.errors import ConfigError, InputError
-from limbloc_ros.core.files import write_bytes, write_text
+from limbloc_ros.files import write_bytes, write_text
 from limbloc_ros.recordings.config_file import load_config
 from limbloc_ros.recordings.open_source import open_source
 from limbloc_ros.rig.check import GOOD, Report, check

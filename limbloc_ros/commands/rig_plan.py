@@ -11,7 +11,7 @@ from tqdm import tqdm
 from limbloc_ros.commands.rig_import import describe, size
 from limbloc_ros.core.camera import Rig
 from limbloc_ros.core.errors import ConfigError
-from limbloc_ros.core.files import write_bytes
+from limbloc_ros.files import write_bytes
 from limbloc_ros.rig.plan import (
     Coverage,
     Fatness,

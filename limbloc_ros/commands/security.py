@@ -7,9 +7,9 @@ import argparse
 import tempfile
 from pathlib import Path
 
+from limbloc_ros.files import write_text
 from limbloc_ros.nodes import smart_space
 from limbloc_ros.nodes.graph_plan import plan_graph
-from limbloc_ros.recordings.results import make_folder, replace_file
 from limbloc_ros.ros.security import OPERATOR, policy
 from limbloc_ros.ros.supervisor import ENCLAVES
 
@@ -37,8 +37,6 @@ def run(args: argparse.Namespace) -> int:
     """Do it."""
     with tempfile.TemporaryDirectory(prefix="limbloc_") as folder:
         plans = plan_graph(smart_space.config_from_arguments(args), Path(folder))
-    text = policy(plans)
-    make_folder(args.out.parent)
-    replace_file(args.out, lambda file: file.write(text.encode()))
+    write_text(args.out, policy(plans))
     print(f"{args.out}: {len(plans)} enclaves below {ENCLAVES}, and {ENCLAVES}/{OPERATOR} for people")
     return 0

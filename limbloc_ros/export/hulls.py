@@ -9,11 +9,11 @@ from pathlib import Path
 from limbloc_ros import __version__
 from limbloc_ros.core.camera import Rig
 from limbloc_ros.core.config import HullConfig
-from limbloc_ros.core.files import replaced
 from limbloc_ros.core.hull import Hull
 from limbloc_ros.core.pipeline import Carver
 from limbloc_ros.export.hull_surface import hull_surface, ply_bytes
 from limbloc_ros.export.recording import recorded_frames
+from limbloc_ros.files import replaced
 from limbloc_ros.recordings.kept_frames import KeptFrames, Pixels
 from limbloc_ros.recordings.results import Run
 from limbloc_ros.recordings.sources import Source

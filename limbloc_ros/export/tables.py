@@ -8,7 +8,7 @@ import io
 import math
 
 from limbloc_ros.core.pose import JOINT_NAMES, Pose
-from limbloc_ros.recordings.results import Run
+from limbloc_ros.recordings.results import Run, stamp_text
 
 
 def csv_text(run: Run, *, first: int = 0, last: int | None = None, only_reliable: bool = False) -> str:
@@ -23,7 +23,7 @@ def csv_text(run: Run, *, first: int = 0, last: int | None = None, only_reliable
     columns = [f"{joint}_{what}_m" for joint in JOINT_NAMES for what in ("x", "y", "z", "sigma")]
     writer.writerow(["frame", "stamp_s", "reliable", "energy", *columns, *(f"{n}_rad" for n in names), "reason"])
     for number, frame in list(enumerate(run.frames))[first : None if last is None else last + 1]:
-        stamp = f"{frame.stamp_ns // 10**9}.{frame.stamp_ns % 10**9:09d}"
+        stamp = stamp_text(frame.stamp_ns)
         pose = frame.outcome
         if not isinstance(pose, Pose):
             writer.writerow([number, stamp, 0, "", *[""] * (len(columns) + len(names)), pose.reason])

@@ -12,7 +12,7 @@ import numpy as np
 
 from limbloc_ros.core.background import BackgroundModel
 from limbloc_ros.core.errors import InputError
-from limbloc_ros.core.files import replaced
+from limbloc_ros.files import replaced
 from limbloc_ros.recordings.npz_file import read_npz
 
 

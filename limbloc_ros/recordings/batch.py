@@ -21,7 +21,7 @@ from limbloc_ros.recordings import offline
 from limbloc_ros.recordings.kept_frames import KeptFrames
 from limbloc_ros.recordings.offline import OfflineConfig
 from limbloc_ros.recordings.open_source import open_source
-from limbloc_ros.recordings.results import Run, make_folder
+from limbloc_ros.recordings.results import Run
 from limbloc_ros.rig.rig_file import load_rig, save_rig
 
 #: A cluster that has not answered after this is not there, s.
@@ -158,7 +158,6 @@ def _outcome(task: Task, run: Run, done_before: bool = False) -> Outcome:
 
 def save_folder(run: Run, rig: Rig, kept: KeptFrames, out: Path) -> None:
     """Everything about a run; `run.json`, which says that it is finished, after all else."""
-    make_folder(out)
     save_rig(rig, out / "rig.yaml")
     kept.save(out)
     run.save(out)

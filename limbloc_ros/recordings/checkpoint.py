@@ -11,8 +11,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from limbloc_ros.core.errors import InputError, OutputError
-from limbloc_ros.recordings.results import FrameResult, load_frames, replace_file, save_frames, with_others
+from limbloc_ros.core.errors import InputError
+from limbloc_ros.recordings.results import FrameResult, load_frames, result_file, save_frames, with_others
 from limbloc_ros.rig.plain_values import read_values
 
 #: Results are written down after this many frames or seconds, whichever comes first.
@@ -75,15 +75,11 @@ class Checkpoint:
     def flush(self) -> None:
         """Write down what is not on disk yet; raises OutputError when that fails."""
         if self._waiting and self._folder is not None:
-            try:
-                self._folder.mkdir(parents=True, exist_ok=True)
-            except OSError as error:
-                raise OutputError(f"{self._folder} cannot be made: {error.strerror}; choose another --out") from None
             path = _chunk(self._folder, self._count)
             for number in {body.number for frame in self._waiting for body in frame.others}:
                 save_frames([frame.of(number) for frame in self._waiting], path.with_name(f"{path.stem}_p{number}.npz"))
-            text = json.dumps(self._state)
-            replace_file(path.with_suffix(".json"), lambda file: file.write(text.encode()))
+            with result_file(path.with_suffix(".json")) as file:
+                file.write_text(json.dumps(self._state), encoding="utf-8", newline="\n")
             save_frames(self._waiting, path)  # last: with it the others count
             self._count += len(self._waiting)
             self._waiting = []

@@ -15,7 +15,7 @@ from limbloc_ros.core.errors import InputError
 from limbloc_ros.core.images import compressed_to_pixels
 from limbloc_ros.recordings.cases import pack_mask, unpack_mask
 from limbloc_ros.recordings.npz_file import read_npz
-from limbloc_ros.recordings.results import replace_file
+from limbloc_ros.recordings.results import result_file
 
 Pixels = NDArray[np.uint8]
 
@@ -73,7 +73,8 @@ class KeptFrames:
                 arrays[f"mask {number} {width} {name}"] = packed
             for name, jpeg in self._images[number].items():
                 arrays[f"image {number} 0 {name}"] = jpeg
-        replace_file(folder / FILE, lambda file: np.savez_compressed(file, **arrays))
+        with result_file(folder / FILE) as file:
+            np.savez_compressed(file, **arrays)
 
     @staticmethod
     def load(folder: Path) -> KeptFrames:

@@ -17,23 +17,23 @@ each row is). Then `joints.npz` also has everybody: `people` [P] ids, `people_jo
 
 from __future__ import annotations
 
-import contextlib
 import csv
 import io
 import json
 import math
-import os
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from limbloc_ros.core.errors import InputError, NoPerson, OutputError
+from limbloc_ros.core.errors import InputError, NoPerson
 from limbloc_ros.core.people import Body
 from limbloc_ros.core.pose import JOINT_NAMES, Flesh, Pose
+from limbloc_ros.files import ADVICE, replaced
 from limbloc_ros.recordings.npz_file import read_npz
 from limbloc_ros.rig.plain_values import read_values
 
@@ -155,7 +155,6 @@ class Run:
             OutputError: the folder cannot be written to (a full disk, no permission).
         """
         folder = Path(folder)
-        make_folder(folder)
         if self.numbers != (1,):
             for number in self.numbers:
                 self.of(number).save_alone(folder / PEOPLE / person_id(number))
@@ -163,9 +162,9 @@ class Run:
 
     def save_alone(self, folder: Path) -> None:
         """Write the four files of the frames' own outcomes."""
-        make_folder(folder)
         self.save_joints(folder / "joints.npz")
-        replace_file(folder / "joint_angles.csv", lambda file: file.write(self._angles_csv().encode()))
+        with result_file(folder / "joint_angles.csv") as file:
+            file.write_text(self._angles_csv(), encoding="utf-8", newline="\n")
         save_frames(self.frames, folder / "run.npz")
         found = [f.outcome for f in self.frames if isinstance(f.outcome, Pose)]
         summary = {
@@ -175,7 +174,8 @@ class Run:
             "reliable": int(self.reliable.sum()),
             "median_energy": float(np.median([pose.energy for pose in found])) if found else None,
         }
-        replace_file(folder / "run.json", lambda file: file.write((json.dumps(summary, indent=2) + "\n").encode()))
+        with result_file(folder / "run.json") as file:
+            file.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8", newline="\n")
 
     def save_joints(self, path: str | Path) -> None:
         """Write just the prediction file, `joints.npz` of the module's table."""
@@ -196,16 +196,15 @@ class Run:
                 "people_sigma": np.stack([run.sigma for run in alone], axis=1),
                 "people_reliable": np.stack([run.reliable for run in alone], axis=1),
             }
-        make_folder(Path(path).parent)
-        replace_file(Path(path), lambda file: np.savez_compressed(file, **arrays))
+        with result_file(Path(path)) as file:
+            np.savez_compressed(file, **arrays)
 
     def _angles_csv(self) -> str:
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
         writer.writerow(["stamp_s", *(f"{name}_rad" for name in self.angle_names), "energy", "reliable"])
         for frame, angles, energy, reliable in zip(self.frames, self.angles, self.energy, self.reliable, strict=True):
-            seconds = f"{frame.stamp_ns // 10**9}.{frame.stamp_ns % 10**9:09d}"
-            writer.writerow([seconds, *(f"{a:.9g}" for a in angles), f"{energy:.6g}", int(reliable)])
+            writer.writerow([stamp_text(frame.stamp_ns), *(f"{a:.9g}" for a in angles), f"{energy:.6g}", int(reliable)])
         return text.getvalue()
 
     @staticmethod
@@ -228,6 +227,16 @@ class Run:
 
 #: Folder of the single people's runs within a run's.
 PEOPLE = "people"
+
+
+def result_file(path: Path) -> AbstractContextManager[Path]:
+    """A temporary name for a file of a run, as `files.replaced`: it survives a power cut, and who fails can go on."""
+    return replaced(path, advice=f"{ADVICE}, then run the same command again: finished frames are kept", durable=True)
+
+
+def stamp_text(stamp_ns: int) -> str:
+    """A stamp in seconds with all its digits, which a float would lose: `1700000000.040000000`."""
+    return f"{stamp_ns // 10**9}.{stamp_ns % 10**9:09d}"
 
 
 def person_id(number: int) -> str:
@@ -284,7 +293,8 @@ def save_frames(frames: Sequence[FrameResult], path: Path) -> None:
         }
         names = arrays["pose_stage_names"]
         arrays["pose_stage_ms"] = np.array([[p.stage_ms.get(str(s), np.nan) for s in names] for p in poses])
-    replace_file(path, lambda file: np.savez_compressed(file, **arrays))
+    with result_file(path) as file:
+        np.savez_compressed(file, **arrays)
 
 
 def load_frames(path: Path) -> tuple[FrameResult, ...]:
@@ -385,33 +395,3 @@ def _times(names: Sequence[str], values: Array) -> dict[str, float]:
 def _union(groups: Any) -> tuple[str, ...]:
     """All names of all groups, each once, in the order of their first appearance."""
     return tuple(dict.fromkeys(name for group in groups for name in group))
-
-
-def make_folder(folder: Path) -> None:
-    """Make an output folder; raises OutputError when that cannot be."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"output folder {folder} cannot be made: {error.strerror}") from None
-
-
-def replace_file(path: Path, write: Callable[[IO[bytes]], Any]) -> None:
-    """Write a file under a temporary name and rename it: no reader ever sees half of it.
-
-    Raises:
-        OutputError: the disk is full or the folder not writable; what was there before is still there.
-    """
-    temporary = path.with_name(f".{path.name}.writing")
-    try:
-        with temporary.open("wb") as file:
-            write(file)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    except OSError as error:
-        with contextlib.suppress(OSError):  # the disk may be gone altogether; the first error is the one to tell
-            temporary.unlink(missing_ok=True)
-        raise OutputError(
-            f"{path} cannot be written: {error.strerror or error}; make room or choose another --out, "
-            "then run the same command again: finished frames are kept"
-        ) from None

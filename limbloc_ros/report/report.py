@@ -7,8 +7,7 @@ import datetime
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from limbloc_ros.core.errors import InputError, OutputError
-from limbloc_ros.core.files import write_bytes
+from limbloc_ros.files import write_bytes
 from limbloc_ros.report.compare import limb_angles
 from limbloc_ros.report.page import Section, Table, build_page
 from limbloc_ros.report.plots_motion import ranges_table
@@ -43,29 +42,22 @@ def write_report(
         the page's path.
 
     Raises:
-        InputError: the folder cannot be written to.
+        OutputError: the folder cannot be written to.
     """
     folder = Path(out_dir)
     todo = [*sample_pictures(run, samples), *run_pictures(run), *comparison_pictures(run)]
     sections = [_summary_section(run, samples)]
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for number, picture in enumerate(todo):
-            if on_picture is not None:
-                on_picture(picture.heading, number, len(todo))
-            png = picture.make()
-            write_bytes(folder / f"{picture.key}.png", png)
-            sections.append(Section(picture.key, picture.heading, picture.text, png, wide=picture.wide))
-        sections += _closing_sections(run)
-        when = (created or datetime.datetime.now().astimezone()).strftime("%Y-%m-%d %H:%M %Z").strip()
-        about = [line for line in (run.source, f"limbloc_ros {run.version}, {when}") if line]
-        page = build_page(run.title, about, sections, f"Made by limbloc_ros {run.version} on {when}.")
-        write_bytes(folder / PAGE, page.encode("utf-8"))
-    except (OSError, OutputError) as error:
-        why = getattr(error, "strerror", "") or error
-        raise InputError(
-            f"the report cannot be written to {folder}: {why}; make room or choose another folder"
-        ) from error
+    for number, picture in enumerate(todo):
+        if on_picture is not None:
+            on_picture(picture.heading, number, len(todo))
+        png = picture.make()
+        write_bytes(folder / f"{picture.key}.png", png)
+        sections.append(Section(picture.key, picture.heading, picture.text, png, wide=picture.wide))
+    sections += _closing_sections(run)
+    when = (created or datetime.datetime.now().astimezone()).strftime("%Y-%m-%d %H:%M %Z").strip()
+    about = [line for line in (run.source, f"limbloc_ros {run.version}, {when}") if line]
+    page = build_page(run.title, about, sections, f"Made by limbloc_ros {run.version} on {when}.")
+    write_bytes(folder / PAGE, page.encode("utf-8"))
     return folder / PAGE
 
 

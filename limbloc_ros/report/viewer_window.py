@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from limbloc_ros.core.errors import InputError
-from limbloc_ros.core.files import replaced
+from limbloc_ros.files import replaced
 from limbloc_ros.report.mesh import Mesh
 from limbloc_ros.report.viewer_scene import COLOURS, LAYERS, Lines, Playback, RunScene
 

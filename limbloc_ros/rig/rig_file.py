@@ -37,8 +37,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from limbloc_ros.core.camera import DISTORTION_COEFFICIENTS, Camera, Rig
-from limbloc_ros.core.errors import OutputError, RigError
-from limbloc_ros.core.files import write_text
+from limbloc_ros.core.errors import RigError
+from limbloc_ros.files import write_text
 from limbloc_ros.rig.plain_values import kind, known_keys, numbers, parse, read_text, required
 from limbloc_ros.rig.volume import derive_volume
 
@@ -127,7 +127,7 @@ def save_rig(rig: Rig, path: str | Path) -> None:
     """Write `rig` as our YAML; `load_rig` gives back the same numbers, bit for bit.
 
     Raises:
-        RigError: the file cannot be written.
+        OutputError: the file cannot be written.
     """
     lines = [
         "# Cameras of a room for limbloc_ros. World: z up, floor at z = 0, metres.",
@@ -151,10 +151,7 @@ def save_rig(rig: Rig, path: str | Path) -> None:
             *(["    ignore:"] if camera.ignore else []),
             *(f"      - [{', '.join(_row(point) for point in polygon)}]" for polygon in camera.ignore),
         ]
-    try:
-        write_text(Path(path), "\n".join(lines) + "\n")
-    except OutputError as error:
-        raise RigError(f"rig file {error}") from None
+    write_text(Path(path), "\n".join(lines) + "\n")
 
 
 def _our_camera(entry: Mapping[str, Any], at: str, folder: Path) -> Camera:

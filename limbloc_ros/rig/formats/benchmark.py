@@ -9,7 +9,7 @@ from pathlib import Path
 
 from limbloc_ros.core.camera import Rig
 from limbloc_ros.core.errors import RigError
-from limbloc_ros.core.files import write_text
+from limbloc_ros.files import write_text
 from limbloc_ros.rig.formats.common import CAMERA_TO_WORLD, Format, FoundCamera, Reading, only_file
 from limbloc_ros.rig.rig_file import load_rig
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from limbloc_ros.core.camera import Rig
 from limbloc_ros.core.errors import RigError
-from limbloc_ros.core.files import write_text
+from limbloc_ros.files import write_text
 from limbloc_ros.rig.formats.common import (
     WORLD_TO_CAMERA,
     Format,

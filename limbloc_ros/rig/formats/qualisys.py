@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from limbloc_ros.core.camera import Rig
 from limbloc_ros.core.errors import RigError
-from limbloc_ros.core.files import write_text
+from limbloc_ros.files import write_text
 from limbloc_ros.rig.formats.common import (
     CAMERA_TO_WORLD,
     Format,

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from limbloc_ros.core.camera import Camera, Rig
 from limbloc_ros.core.errors import RigError
-from limbloc_ros.core.files import write_text
+from limbloc_ros.files import write_text
 from limbloc_ros.rig.formats.common import CAMERA_TO_WORLD, Format, FoundCamera, Reading, row
 from limbloc_ros.rig.geometry import inverse
 from limbloc_ros.rig.plain_values import kind, numbers, read_text, read_values, required, yaml_values
