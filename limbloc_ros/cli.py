@@ -48,7 +48,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     arguments = _joined(list(sys.argv[1:] if argv is None else argv))
     name = next((word for word in arguments if not word.startswith("-")), "")
-    args = _parser(name).parse_args(arguments)
+    # While modules are imported there is nothing to clean up, and numpy would make an ImportError of an interrupt.
+    ours = signal.signal(signal.SIGINT, signal.SIG_DFL)
+    parser = _parser(name)
+    signal.signal(signal.SIGINT, ours)
+    args = parser.parse_args(arguments)
     if not args.command:
         _parser("").print_help()
         return EXIT_INPUT

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The smart space's plan and its supervisor: real processes, killed and interrupted."""
 
+import argparse
 import json
 import os
 import signal
@@ -184,7 +185,7 @@ def test_what_is_wrong_in_the_file_is_named(tmp_path, text, kind, message):
 
 
 def test_options_come_on_top_of_the_file(tmp_path):
-    parser = smart_space.argparse.ArgumentParser()
+    parser = argparse.ArgumentParser()
     smart_space.add_arguments(parser)
     arguments = (
         "--source bag --bag run1 --rig lab.yaml --cameras a,b --set pose.fit.engine=paper --set transport=compressed"
@@ -200,6 +201,25 @@ def test_options_come_on_top_of_the_file(tmp_path):
 def test_the_command_line_prints_errors_without_a_trace(capsys, tmp_path):
     assert smart_space.main(["--source", "cameras", "--rig", str(tmp_path / "no.yaml")]) == 1
     assert "no.yaml" in capsys.readouterr().err
+
+
+IMPATIENT = """
+import os, signal, sys
+class Finder:
+    def find_spec(self, name, path=None, target=None):
+        if name == "numpy":
+            os.kill(os.getpid(), signal.SIGINT)
+sys.meta_path.insert(0, Finder())
+from limbloc_ros.{module} import main
+main({arguments})
+"""
+
+
+@pytest.mark.parametrize(("module", "arguments"), [("nodes.smart_space", []), ("cli", ["run"]), ("cli", ["process"])])
+def test_ctrl_c_while_modules_are_imported_ends_quietly(module, arguments):
+    script = IMPATIENT.format(module=module, arguments=arguments)
+    result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60)
+    assert (result.returncode, result.stdout, result.stderr) == (-signal.SIGINT, "", "")
 
 
 # --- the environment ---

@@ -18,6 +18,7 @@ EPILOG = smart_space.EXAMPLES.replace("  smart_space", "  limbloc run")
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
+    smart_space.load()
     smart_space.add_arguments(parser)
 
 

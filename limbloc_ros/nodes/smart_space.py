@@ -1,20 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The whole smart space from one YAML file: cameras, masks, hull, posture, in few processes."""
+"""The whole smart space from one YAML file: cameras, masks, hull, posture, in few processes.
+
+What takes long to import is imported by `load`, so that Ctrl-C ends that quietly, too.
+"""
 
 from __future__ import annotations
 
-import argparse
+import importlib
+import signal
 import sys
-import tempfile
-from collections.abc import Sequence
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from limbloc_ros.core.errors import ConfigError, LimblocError
-from limbloc_ros.nodes.graph_plan import SmartSpaceConfig, load_config, plan_graph
-from limbloc_ros.rig.plain_values import yaml_values
-from limbloc_ros.ros.environment import config_file, graph_environment
-from limbloc_ros.ros.supervisor import Supervisor
+if TYPE_CHECKING:
+    import argparse
+    from collections.abc import Sequence
+
+    from limbloc_ros.nodes.graph_plan import SmartSpaceConfig
+
+#: Exit code after Ctrl-C before the processes were started.
+EXIT_INTERRUPTED = 130
+
+DESCRIPTION = "The whole smart space from one YAML file: cameras, masks, hull, posture, in few processes."
 
 EXAMPLES = """examples:
   smart_space                                          eight simulated cameras, and a person who moves
@@ -23,6 +29,11 @@ EXAMPLES = """examples:
   smart_space my_room.yaml                             your own copy of config/smart_space.yaml
   smart_space --set pose.fit.engine=paper --set processes.cameras_per_process=2
 """
+
+
+def load() -> None:
+    """Import what `run` needs."""
+    importlib.import_module("limbloc_ros.nodes.graph_plan")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -56,6 +67,11 @@ def config_from_arguments(options: argparse.Namespace) -> SmartSpaceConfig:
     Raises:
         ConfigError: the file or an option is wrong.
     """
+    from limbloc_ros.core.errors import ConfigError
+    from limbloc_ros.nodes.graph_plan import load_config
+    from limbloc_ros.rig.plain_values import yaml_values
+    from limbloc_ros.ros.environment import config_file
+
     overrides: dict[str, Any] = {}
     for text in options.set:
         key, equals, value = text.partition("=")
@@ -90,6 +106,13 @@ def run(config: SmartSpaceConfig) -> int:
     Raises:
         LimblocError: the config, rig or bag cannot be used.
     """
+    import tempfile
+    from pathlib import Path
+
+    from limbloc_ros.nodes.graph_plan import plan_graph
+    from limbloc_ros.ros.environment import graph_environment
+    from limbloc_ros.ros.supervisor import Supervisor
+
     with tempfile.TemporaryDirectory(prefix="limbloc_") as folder:
         plans = plan_graph(config, Path(folder))
         environment = graph_environment(config.network)
@@ -102,8 +125,16 @@ def run(config: SmartSpaceConfig) -> int:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """The command line of `ros2 run limbloc_ros smart_space`."""
+    # While modules are imported there is nothing to clean up, and numpy would make an ImportError of an interrupt.
+    ours = signal.signal(signal.SIGINT, signal.SIG_DFL)
+    import argparse
+
+    from limbloc_ros.core.errors import LimblocError
+
+    load()
+    signal.signal(signal.SIGINT, ours)
     parser = argparse.ArgumentParser(
-        "smart_space", description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
+        "smart_space", description=DESCRIPTION, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     add_arguments(parser)
     arguments = list(sys.argv[1:] if argv is None else argv)
@@ -117,6 +148,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     except LimblocError as error:
         print(f"smart_space: {error}", file=sys.stderr)
         return 1
+    except KeyboardInterrupt:
+        return EXIT_INTERRUPTED
 
 
 if __name__ == "__main__":

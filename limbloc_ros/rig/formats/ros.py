@@ -87,10 +87,8 @@ def read_transforms(path: Path) -> Transforms:
         raise RigError(f"transforms {path}{error}") from None
     entries: list[Any] = []
     for document in documents:
-        if isinstance(document, Mapping) and "transforms" in document:
-            entries += document["transforms"]
-        else:
-            entries += document if isinstance(document, list) else [document]
+        listed = document.get("transforms", document) if isinstance(document, Mapping) else document
+        entries += listed if isinstance(listed, list) else [listed]
     found = dict(_from_entry(entry, f"{path}: transform {i}") for i, entry in enumerate(entries))
     if not found:
         raise RigError(f"transforms {path}: expected transforms with header.frame_id, child_frame_id, found none")
