@@ -256,7 +256,7 @@ def _mutate_bytes(data: bytes, most: int, rng: random.Random) -> bytes:
 
 
 def _read_bag(path: Any) -> None:
-    from limbloc_ros.commands._rig_bag import bag_intrinsics, bag_transforms
+    from limbloc_ros.recordings.bag_calibration import bag_intrinsics, bag_transforms
     from limbloc_ros.recordings.bag_frames import camera_streams, frame_sets
     from limbloc_ros.recordings.bags import BagReader
 

@@ -25,10 +25,10 @@ with atheris.instrument_imports(include=["limbloc_ros"], exclude=[*KERNELS, "lim
     import fuzz.binary_targets  # noqa: F401  (enters its targets)
     from fuzz.targets import TARGETS, check
     from limbloc_ros import cli  # noqa: F401
-    from limbloc_ros.commands import _rig_bag, report  # noqa: F401
+    from limbloc_ros.commands import report  # noqa: F401
     from limbloc_ros.export import bvh, gltf, tables, trc  # noqa: F401
     from limbloc_ros.nodes import composed, graph_plan  # noqa: F401
-    from limbloc_ros.recordings import background_file, bag_frames, cases, kept_frames  # noqa: F401
+    from limbloc_ros.recordings import background_file, bag_calibration, bag_frames, cases, kept_frames  # noqa: F401
     from limbloc_ros.report import compare, summary  # noqa: F401
     from limbloc_ros.rig import importing, rig_file  # noqa: F401
     from limbloc_ros.rig.formats import recognise  # noqa: F401

@@ -14,7 +14,8 @@ import pytest
 import yaml
 
 from limbloc_ros.core.errors import InputError, OutputError
-from limbloc_ros.recordings.bags import TYPESTORE, BagReader, BagWriter, deserialise
+from limbloc_ros.recordings.bags import TYPESTORE, BagReader, BagWriter, deserialise, is_bag
+from limbloc_ros.recordings.image_sets import find_cameras
 
 STORAGES = ["mcap", "sqlite3"]
 SUFFIX = {"mcap": ".mcap", "sqlite3": ".db3"}
@@ -247,6 +248,15 @@ def test_a_bag_whose_file_is_gone_is_refused(tmp_path):
     data_file(tmp_path / "bag").unlink()
     with pytest.raises(InputError, match=r"bag"):
         BagReader(tmp_path / "bag")
+
+
+@pytest.mark.parametrize("storage", STORAGES)
+def test_a_bag_is_known_as_one_also_without_its_description(tmp_path, storage):
+    bag = tmp_path / "bag"
+    write_bag(bag, storage)
+    (bag / "metadata.yaml").unlink()  # as a killed recorder leaves it
+    assert is_bag(bag) and is_bag(data_file(bag)) and not is_bag(tmp_path)
+    assert find_cameras(bag) == ["cam0"]
 
 
 def test_an_unknown_topic_lists_the_known_ones(tmp_path):

@@ -11,11 +11,11 @@ import cv2
 import numpy as np
 from tqdm import tqdm
 
-from limbloc_ros.commands._rig_footage import count_sets, find_cameras, image_sets
 from limbloc_ros.commands.rig_import import describe
 from limbloc_ros.core.camera import Rig
 from limbloc_ros.core.errors import ConfigError, InputError, OutputError, RigError
 from limbloc_ros.files import write_bytes, write_text
+from limbloc_ros.recordings.image_sets import count_sets, find_cameras, image_sets
 from limbloc_ros.rig.advice import CameraQuality, assess, what_to_record
 from limbloc_ros.rig.board import Board, parse_board
 from limbloc_ros.rig.bundle import View

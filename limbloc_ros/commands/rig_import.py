@@ -10,10 +10,10 @@ from typing import TypeVar
 
 import numpy as np
 
-from limbloc_ros.commands._rig_bag import bag_intrinsics, bag_transforms
-from limbloc_ros.commands._rig_footage import is_bag
 from limbloc_ros.core.camera import Rig
 from limbloc_ros.core.errors import ConfigError, InputError, OutputError
+from limbloc_ros.recordings.bag_calibration import bag_intrinsics, bag_transforms
+from limbloc_ros.recordings.bags import is_bag
 from limbloc_ros.recordings.videos import VIDEO_SUFFIXES, ImageFolder, Stream, Video, pictures_in
 from limbloc_ros.rig.formats import FORMATS, recognise
 from limbloc_ros.rig.formats.common import CAMERA_TO_WORLD, WORLD_TO_CAMERA, Reading

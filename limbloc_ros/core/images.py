@@ -158,13 +158,21 @@ def _check_size(width: int, height: int, what: str) -> None:
 
 
 def compressed_to_pixels(msg: CompressedPicture) -> Pixels:
+    """A compressed image -> pixels, as `decode_picture`."""
+    return decode_picture(msg.data if isinstance(msg.data, bytes) else msg.data.tobytes(), msg.format)
+
+
+def decode_picture(data: bytes, claimed: str = "") -> Pixels:
     """JPEG or PNG -> uint8 [height, width] (grey) or [height, width, 3] (BGR).
+
+    Args:
+        data: the file's bytes, which tell what it is.
+        claimed: the format by its name, for messages.
 
     Raises:
         InputError: neither JPEG nor PNG, truncated, damaged, or of an impossible size.
     """
-    data = msg.data if isinstance(msg.data, bytes) else msg.data.tobytes()
-    kind = _check_compressed(data, msg.format)
+    kind = _check_compressed(data, claimed)
     mask = decode_mask(data)
     if mask is not None:
         return mask

@@ -11,8 +11,9 @@ from typing import Any
 from limbloc_ros.core.camera import Rig
 from limbloc_ros.core.config import BackgroundConfig, FitConfig, HullConfig, SyncConfig, from_mapping
 from limbloc_ros.core.errors import InputError
+from limbloc_ros.recordings.bags import is_bag
 from limbloc_ros.recordings.offline import OfflineConfig
-from limbloc_ros.recordings.open_source import is_bag, open_source
+from limbloc_ros.recordings.open_source import open_source
 from limbloc_ros.recordings.results import Run
 from limbloc_ros.recordings.sources import MaskSet, Source
 from limbloc_ros.rig.rig_file import load_rig

@@ -371,6 +371,15 @@ class BagWriter:
             return
 
 
+def is_bag(path: Path) -> bool:
+    """Whether a file or folder looks like a bag; one of ROS 1 too, so that `BagReader` says what to do with it."""
+    if path.is_file():
+        return path.suffix in (*SUFFIXES, ".bag")
+    return path.is_dir() and (
+        (path / "metadata.yaml").is_file() or any(child.suffix in SUFFIXES for child in path.iterdir())
+    )
+
+
 def deserialise(kind: str, cdr: bytes, where: str = "message") -> Any:
     """A CDR message of type `kind` (e.g. `sensor_msgs/msg/Image`) as a `rosbags` dataclass; arrays are numpy arrays.
 

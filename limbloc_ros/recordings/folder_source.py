@@ -23,7 +23,7 @@ from limbloc_ros.recordings.sources import (
     file_identity,
     rig_identity,
 )
-from limbloc_ros.recordings.videos import Stream, find_streams
+from limbloc_ros.recordings.videos import Stream, StreamReader, find_streams, frame_numbers
 
 Pixels = NDArray[np.uint8]
 
@@ -64,7 +64,7 @@ class FolderSource:
         self._config, self._pictures, self._estimate, self._are_masks = config, pictures or {}, estimate, are_masks
         self._streams = find_streams(folder, rig.names)
         self._fps = _common_fps(self._streams, fps)
-        self._numbers = sorted(set().union(*(stream.numbers for stream in self._streams.values())))
+        self._numbers = frame_numbers(self._streams)
         self.frames: int | None = len(self._numbers)
         self.about: dict[str, Any] = {
             "input": str(folder),
@@ -89,7 +89,7 @@ class FolderSource:
             stream.notes.clear()
         self.notes.clear()
         segmenter = None if self._are_masks else self._segmenter()
-        readers = {name: _Reader(stream, self._numbers) for name, stream in self._streams.items()}
+        readers = {name: StreamReader(stream, self._numbers) for name, stream in self._streams.items()}
         for number in self._numbers:
             start = time.process_time()
             read = ((name, reader.take(number)) for name, reader in readers.items())
@@ -124,22 +124,6 @@ def silhouette(image: Pixels) -> Pixels:
     """A picture of a silhouette -> mask of 0 and 255; bright is foreground (any non-zero value if it holds 0 and 1)."""
     grey = image if image.ndim == 2 else image.max(axis=2)
     return np.where(grey > (127 if grey.max(initial=0) > 1 else 0), np.uint8(255), np.uint8(0))
-
-
-class _Reader:
-    """Takes frames out of a stream by number, none twice and none out of order."""
-
-    def __init__(self, stream: Stream, numbers: list[int]) -> None:
-        self._frames = stream.read(numbers)
-        self._next = next(self._frames, None)
-
-    def take(self, number: int) -> Pixels | None:
-        """Frame number `number`, None if the stream lacks it."""
-        if self._next is None or self._next[0] != number:
-            return None
-        pixels = self._next[1]
-        self._next = next(self._frames, None)
-        return pixels
 
 
 def _common_fps(streams: Mapping[str, Stream], fps: float | None) -> float:

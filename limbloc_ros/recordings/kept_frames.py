@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -12,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from limbloc_ros.core.errors import InputError
-from limbloc_ros.core.images import compressed_to_pixels
+from limbloc_ros.core.images import decode_picture
 from limbloc_ros.recordings.cases import pack_mask, unpack_mask
 from limbloc_ros.recordings.npz_file import read_npz
 from limbloc_ros.recordings.results import result_file
@@ -100,7 +99,7 @@ class KeptFrames:
                 if kind == "mask" and array.dtype == np.uint8 and array.shape[1] == -(-int(width) // 8):
                     kept._masks[int(number)][name] = (array, int(width))
                 elif kind == "image" and array.dtype == np.uint8:
-                    compressed_to_pixels(SimpleNamespace(format="jpeg", data=array))
+                    decode_picture(array.tobytes(), "jpeg")  # says so when it is damaged
                     kept._images[int(number)][name] = array
                 else:
                     raise ValueError(key)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from limbloc_ros.core.camera import Rig
 from limbloc_ros.core.errors import InputError
-from limbloc_ros.recordings.bags import SUFFIXES
+from limbloc_ros.recordings.bags import is_bag
 from limbloc_ros.recordings.cases import is_case, load_case
 from limbloc_ros.recordings.folder_source import ESTIMATE, FolderSource
 from limbloc_ros.recordings.offline import OfflineConfig
@@ -106,10 +106,3 @@ def background_pictures(folder: Path, rig: Rig) -> dict[str, Pixels]:
         pictures[name] = read_picture(found[name])
         check_size(pictures[name], rig, name, str(found[name]))
     return pictures
-
-
-def is_bag(path: Path) -> bool:
-    """Whether a file or folder is a bag."""
-    if path.is_file():
-        return path.suffix in (*SUFFIXES, ".bag")
-    return (path / "metadata.yaml").is_file() or any(child.suffix in SUFFIXES for child in path.iterdir())

@@ -3,10 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Protocol
 
 import cv2
@@ -14,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from limbloc_ros.core.errors import InputError
-from limbloc_ros.core.images import compressed_to_pixels
+from limbloc_ros.core.images import decode_picture
 
 Pixels = NDArray[np.uint8]
 
@@ -118,6 +117,27 @@ class ImageFolder:
             yield number, pixels
 
 
+class StreamReader:
+    """Takes frames out of a stream by number, none twice and none out of order."""
+
+    def __init__(self, stream: Stream, numbers: Sequence[int]) -> None:
+        self._frames = stream.read(numbers)
+        self._next = next(self._frames, None)
+
+    def take(self, number: int) -> Pixels | None:
+        """Frame number `number`, None if the stream lacks it."""
+        if self._next is None or self._next[0] != number:
+            return None
+        pixels = self._next[1]
+        self._next = next(self._frames, None)
+        return pixels
+
+
+def frame_numbers(streams: Mapping[str, Stream]) -> list[int]:
+    """The numbers of all frames that any of the streams has, in order."""
+    return sorted(set().union(*(stream.numbers for stream in streams.values())))
+
+
 def pictures_in(folder: Path) -> list[Path]:
     """The pictures in a folder, by name."""
     return sorted(f for f in folder.iterdir() if f.suffix.lower() in PICTURE_SUFFIXES)
@@ -135,7 +155,7 @@ def read_picture(path: Path) -> Pixels:
         raise InputError(f"{path} cannot be read: {error.strerror}") from None
     if path.suffix.lower() in (".png", ".jpg", ".jpeg"):
         try:
-            return compressed_to_pixels(SimpleNamespace(format=path.suffix, data=data))
+            return decode_picture(data, path.suffix)
         except InputError as error:
             raise InputError(f"{path}: {error}") from None
     pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None

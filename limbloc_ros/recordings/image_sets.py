@@ -11,17 +11,10 @@ from numpy.typing import NDArray
 
 from limbloc_ros.core.errors import InputError
 from limbloc_ros.recordings.bag_frames import IMAGE_ENDINGS, camera_streams, frame_sets
-from limbloc_ros.recordings.bags import BagReader
-from limbloc_ros.recordings.videos import VIDEO_SUFFIXES, find_streams, pictures_in
+from limbloc_ros.recordings.bags import BagReader, is_bag
+from limbloc_ros.recordings.videos import VIDEO_SUFFIXES, StreamReader, find_streams, frame_numbers, pictures_in
 
 Pixels = NDArray[np.uint8]
-
-
-def is_bag(path: Path) -> bool:
-    """Whether `path` is a rosbag2 folder or file."""
-    if path.is_file():
-        return path.suffix in (".mcap", ".db3")
-    return path.is_dir() and ((path / "metadata.yaml").is_file() or any(path.glob("*.mcap")))
 
 
 def find_cameras(path: Path) -> list[str]:
@@ -64,20 +57,15 @@ def image_sets(path: Path, names: Sequence[str], every: int = 1) -> Iterator[tup
                     yield number, {name: frame.pixels() for name, frame in frames.items.items()}
         return
     streams_of = find_streams(path, names)
-    numbers = sorted(set().union(*(stream.numbers for stream in streams_of.values())))[::every]
-    readers = {name: stream.read(numbers) for name, stream in streams_of.items()}
-    waiting = {name: next(reader, None) for name, reader in readers.items()}
+    numbers = frame_numbers(streams_of)[::every]
+    readers = {name: StreamReader(stream, numbers) for name, stream in streams_of.items()}
     for number in numbers:
-        images = {}
-        for name, frame in waiting.items():
-            if frame is not None and frame[0] == number:
-                images[name] = frame[1]
-                waiting[name] = next(readers[name], None)
-        yield number, images
+        taken = ((name, reader.take(number)) for name, reader in readers.items())
+        yield number, {name: pixels for name, pixels in taken if pixels is not None}
 
 
 def count_sets(path: Path, names: Sequence[str]) -> int | None:
     """How many sets a folder has; None for a bag, where only reading tells."""
     if is_bag(path):
         return None
-    return len(set().union(*(stream.numbers for stream in find_streams(path, names).values())))
+    return len(frame_numbers(find_streams(path, names)))
