@@ -174,6 +174,7 @@ def test_plan_for_a_bag_of_masks_needs_no_segmentation(tmp_path):
         ("{source: cameras, rig: lab.yaml, cameras: [cam7]}", RigError, r"no camera 'cam7'; it has cam0, cam1, cam2"),
         ("{source: bag, rig: lab.yaml, bag: none}", InputError, r"there is nothing"),
         ("{segmentation_of: {cam9: {}}}", ConfigError, r"segmentation_of: expected names of cameras .*got cam9"),
+        ("{segmentation_of: {7: {}, a: {}}}", ConfigError, r"segmentation_of: expected names of cameras .*got 7, a"),
         ("{simulated_cameras: {width: wide}}", ConfigError, r"width: expected a whole number, got 'wide'"),
     ],
 )

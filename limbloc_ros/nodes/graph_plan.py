@@ -206,7 +206,7 @@ class _Plan:
     ) -> list[ProcessPlan]:
         """Segmentation of the cameras in `transports`, carving, pose and recording."""
         c = self.config
-        if unknown := sorted(set(c.segmentation_of) - set(names)):
+        if unknown := sorted(map(str, set(c.segmentation_of) - set(names))):
             raise ConfigError(
                 f"segmentation_of: expected names of cameras ({', '.join(names)}), got {', '.join(unknown)}"
             )
