@@ -14,6 +14,7 @@ from geometry_msgs.msg import PoseArray
 from ros_graph import DOMAIN, Graph
 
 from limbloc_ros.ros import topics
+from limbloc_ros.ros.node_main import REFUSED
 
 
 @pytest.fixture
@@ -51,7 +52,7 @@ def test_a_signal_in_the_middle_of_work_ends_the_process_cleanly(graph: Graph, n
 def test_a_bad_parameter_is_one_line_not_a_trace() -> None:
     process = start("number_of_cameras:=99")
     output, _ = process.communicate(timeout=30)
-    assert process.returncode == 1
+    assert process.returncode == REFUSED
     assert "parameter number_of_cameras" in output
     assert "expected int from 2 to 16" in output
     assert "Traceback" not in output
@@ -60,6 +61,6 @@ def test_a_bad_parameter_is_one_line_not_a_trace() -> None:
 def test_an_unknown_motion_lists_the_known_ones() -> None:
     process = start("number_of_cameras:=2", "width:=64", "height:=64", "motions:=[moonwalk]")
     output, _ = process.communicate(timeout=30)
-    assert process.returncode == 1
+    assert process.returncode == REFUSED
     assert "moonwalk" in output
     assert "walk" in output

@@ -130,3 +130,8 @@ def test_atomic_change_over_two_sections_is_all_or_nothing(context: Context) -> 
         [Parameter("background.open_px", value=2), Parameter("lists.corner_m", value=[0.0, 0.0, 1.0])]
     ).successful
     assert seen == [BackgroundConfig(open_px=2), Lists(corner_m=(0.0, 0.0, 1.0))]
+
+
+def test_whole_numbers_in_a_list_of_floats_are_explained(context: Context) -> None:
+    with pytest.raises(ConfigError, match=r"corner_m.*write 1\.0, not 1"):
+        NodeParameters(make_node(context, corner_m=[1, 2, 3])).declare(Lists)

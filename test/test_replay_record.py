@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 
 import numpy as np
@@ -134,6 +135,39 @@ class Answerer(Node):
             time.sleep(0.05)
             self.joints.publish(PoseArray(header=make_header(T0 + 40 * k * MS, "room")))
         self.open %= 2
+
+
+def test_a_failure_of_the_replay_is_not_taken_for_its_end(make, tmp_path, monkeypatch):
+    write_bag(tmp_path / "walk")
+    monkeypatch.setattr(BagReader, "messages", lambda *_: 1 / 0)
+    failures = []
+    monkeypatch.setattr(threading, "excepthook", failures.append)
+    node = make(ReplayNode, bag=str(tmp_path / "walk"), wait_for_subscribers_s=0.0)
+    assert node.done.wait(5.0)
+    node._thread.join()
+    assert "division by zero" in node.error
+    assert failures[0].exc_type is ZeroDivisionError  # with its trace, for whoever mends it
+
+
+def test_the_clock_never_goes_back(make, context, tmp_path):
+    """The timer and the replay's thread both publish it."""
+    write_bag(tmp_path / "walk", count=50)
+    node = make(ReplayNode, bag=str(tmp_path / "walk"), wait_for_subscribers_s=0.0, rate=4.0)
+    told = []
+    node._clock.publish = lambda msg: told.append(msg.clock.sec * 10**9 + msg.clock.nanosec)
+    publish = node._publish_clock
+
+    def slow_timer():
+        while not node.done.is_set():
+            publish()
+
+    timers = [threading.Thread(target=slow_timer) for _ in range(2)]
+    for timer in timers:
+        timer.start()
+    assert node.done.wait(10.0)
+    for timer in timers:
+        timer.join()
+    assert told == sorted(told)
 
 
 def test_recording_a_replay_gives_the_same_bytes(make, context, tmp_path):

@@ -19,6 +19,7 @@ import signal
 import sys
 import threading
 import time
+import typing
 from collections.abc import Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
@@ -29,9 +30,10 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.utilities import remove_ros_args
 
-from limbloc_ros.core.errors import ConfigError, LimblocError
+from limbloc_ros.core.errors import ConfigError
 from limbloc_ros.rig.plain_values import yaml_values
 from limbloc_ros.ros import node_main
+from limbloc_ros.ros.node_main import REFUSED
 
 #: Node classes by kind; their modules are imported when asked for, because each brings its own libraries.
 KINDS = {
@@ -44,8 +46,8 @@ KINDS = {
     "foxglove_bridge": "FoxgloveBridge",
 }
 
-#: Exit code when a node refused its parameters or input: starting again would not help.
-REFUSED = 2
+#: Nodes that may end by themselves, and the process with them.
+FINITE = ("replay", "record")
 
 #: A process whose parent has died must be gone after this, s.
 ORPHAN_GRACE_S = 5.0
@@ -78,16 +80,15 @@ def run(argv: Sequence[str] | None = None) -> int:
     if len(arguments) != 1:
         print(__doc__, file=sys.stderr)
         return REFUSED
+    try:
+        description = parse(arguments[0])
+    except ConfigError as error:
+        print(error, file=sys.stderr)
+        return REFUSED
     nodes: list[Node] = []
-    refused = False
 
     def make() -> list[Node]:
-        nonlocal refused
-        try:
-            build(parse(arguments[0]), nodes)
-        except LimblocError:
-            refused = True
-            raise
+        build(description, nodes)
         return nodes
 
     def over() -> bool:
@@ -95,14 +96,12 @@ def run(argv: Sequence[str] | None = None) -> int:
         return bool(ends) and all(end.is_set() for end in ends)
 
     # `until` is looked at after every callback, so it is only given where a node can end by itself.
-    finite = any(kind in arguments[0] for kind in ("replay", "record"))
+    finite = any(isinstance(entry, Mapping) and entry.get("kind") in FINITE for entry in description["nodes"])
     code = node_main.main(make, everything, over if finite else None)
     for node in nodes:
         if hasattr(node, "summary"):
             print(node.summary(), flush=True)
-    if refused or any(getattr(node, "error", None) for node in nodes):
-        return REFUSED
-    return code
+    return REFUSED if any(getattr(node, "error", None) for node in nodes) else code
 
 
 def parse(text: str) -> Mapping[str, Any]:
@@ -126,15 +125,20 @@ def build(description: Mapping[str, Any], nodes: list[Node]) -> None:
     """Make the described nodes and append them to `nodes`.
 
     Raises:
-        ConfigError: an unknown kind of node, or a parameter that the node does not have.
+        ConfigError: an entry that describes no node, an unknown kind of node, or a parameter that the node does not
+            have.
     """
     for entry in description["nodes"]:
-        kind = entry.get("kind")
-        if kind not in KINDS:
-            raise ConfigError(f"nodes: kind: expected one of {', '.join(KINDS)}, got {kind!r}")
+        if not isinstance(entry, Mapping):
+            raise ConfigError(f"nodes: expected a mapping with the node's kind, got {entry!r:.80}")
+        kind, parameters = entry.get("kind"), entry.get("parameters") or {}
+        if not isinstance(kind, str) or kind not in KINDS:
+            raise ConfigError(f"nodes: kind: expected one of {', '.join(KINDS)}, got {kind!r:.80}")
+        if not isinstance(parameters, Mapping):
+            raise ConfigError(f"nodes: {kind}: parameters: expected a mapping, got {parameters!r:.80}")
         module = import_module(f"limbloc_ros.nodes.{kind}")
         node_class = getattr(module, KINDS[kind])
-        values = _with_floats(module, flatten(entry.get("parameters") or {}))
+        values = _with_floats(module, flatten(parameters))
         node = node_class(
             entry.get("name") or kind,
             namespace=description.get("namespace") or "",
@@ -163,10 +167,17 @@ def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 def _with_floats(module: ModuleType, values: Mapping[str, Any]) -> dict[str, Any]:
     """People write 10 where a parameter is 10.0, which ROS refuses: convert what the node's settings say is a float."""
     settings = [v for v in vars(module).values() if isinstance(v, type) and dataclasses.is_dataclass(v)]
-    defaults = [(f.name, type(f.default)) for kind in settings for f in dataclasses.fields(kind)]
-    floats = {name for name, kind in defaults if kind is float} - {name for name, kind in defaults if kind is not float}
+    kinds = [item for kind in settings for item in typing.get_type_hints(kind).items()]
+    wanted = (float, tuple[float, ...])
+    floats = {name for name, kind in kinds if kind in wanted} - {name for name, kind in kinds if kind not in wanted}
+
+    def converted(value: Any) -> Any:
+        if isinstance(value, list):
+            return [converted(item) for item in value]
+        return float(value) if type(value) is int else value
+
     return {
-        name: float(value) if type(value) is int and name.rpartition(".")[2] in floats else value
+        name: converted(value) if name.rpartition(".")[2] in floats else value  # sections are told by their prefix
         for name, value in values.items()
     }
 

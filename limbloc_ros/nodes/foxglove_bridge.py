@@ -20,11 +20,11 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 
 from limbloc_ros.core.config import setting
 from limbloc_ros.core.errors import ConfigError, InputError
-from limbloc_ros.nodes.record import topic_patterns
 from limbloc_ros.recordings.bags import TYPESTORE
 from limbloc_ros.ros import node_main
 from limbloc_ros.ros.parameters import NodeParameters
 from limbloc_ros.ros.raw_messages import message_class
+from limbloc_ros.ros.topics import patterns
 
 DISCOVERY_PERIOD_S = 0.5
 #: Interest of viewers comes from the server's own thread and is acted on this often.
@@ -68,10 +68,7 @@ class FoxgloveBridge(Node):
         self._foxglove = foxglove
         self.settings = NodeParameters(self).declare(FoxgloveSettings)
         s = self.settings
-        self._include, self._exclude = (
-            topic_patterns("topics", s.topics or (".*",)),
-            topic_patterns("exclude", s.exclude),
-        )
+        self._include, self._exclude = patterns("topics", s.topics or (".*",)), patterns("exclude", s.exclude)
         self._hidden = re.compile(HIDDEN)
         self._topics: dict[str, _Topic] = {}
         self._refused: set[str] = set()

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import re
 import threading
 import time
 from collections.abc import Callable
@@ -17,11 +16,12 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 from limbloc_ros.core.config import setting
-from limbloc_ros.core.errors import ConfigError, InputError, OutputError
+from limbloc_ros.core.errors import InputError, OutputError
 from limbloc_ros.recordings.bags import BagWriter
 from limbloc_ros.ros import node_main
 from limbloc_ros.ros.parameters import NodeParameters
 from limbloc_ros.ros.raw_messages import message_class
+from limbloc_ros.ros.topics import patterns
 
 DISCOVERY_PERIOD_S = 0.5
 
@@ -75,8 +75,8 @@ class RecordNode(Node):
         self.settings = NodeParameters(self).declare(RecordSettings)
         s = self.settings
         default = (*DEFAULT_TOPICS, *self._image_patterns())
-        self._include = topic_patterns("topics", s.topics or default)
-        self._exclude = topic_patterns("exclude", s.exclude)
+        self._include = patterns("topics", s.topics or default)
+        self._exclude = patterns("exclude", s.exclude)
         self.done = threading.Event()
         self.error: str | None = None
         self._subscriptions_by_topic: dict[str, Any] = {}
@@ -184,14 +184,6 @@ class RecordNode(Node):
         self.error = str(error)
         self.get_logger().fatal(self.error)
         self.done.set()
-
-
-def topic_patterns(parameter: str, texts: tuple[str, ...]) -> list[re.Pattern[str]]:
-    """Regular expressions of topic names; raises ConfigError, naming the parameter, when one is none."""
-    try:
-        return [re.compile(text) for text in texts]
-    except re.error as error:
-        raise ConfigError(f"parameter {parameter}: {error.pattern!r} is no regular expression ({error})") from error
 
 
 def main() -> int:

@@ -30,7 +30,7 @@ from limbloc_ros.ros import node_main
 from limbloc_ros.ros.messages import stamp_ns
 from limbloc_ros.ros.parameters import NodeParameters
 from limbloc_ros.ros.raw_messages import check_cdr, message_class
-from limbloc_ros.ros.topics import JOINTS, STREAM_QOS
+from limbloc_ros.ros.topics import JOINTS, STREAM_QOS, patterns
 
 IMAGES = re.compile(r"/image_raw(/compressed)?$")
 MASKS = re.compile(r"/mask(/compressed)?$")
@@ -100,6 +100,7 @@ class ReplayNode(Node):
         self.error: str | None = None
         self.published = self.unanswered = self.invalid = self.steps = 0
         self._stop = threading.Event()
+        self._clock_lock = threading.Lock()
         self._answered = threading.Condition()
         self._answers: set[int] = set()
         self._bag = BagReader(self.settings.bag)
@@ -154,11 +155,8 @@ class ReplayNode(Node):
         """The bag's topics that are wanted."""
         known = self._bag.topics
         if self.settings.topics:
-            try:
-                patterns = [re.compile(p) for p in self.settings.topics]
-            except re.error as error:
-                raise ConfigError(f"parameter topics: {error.pattern!r} is no regular expression ({error})") from error
-            chosen = {n: t for n, t in known.items() if any(p.fullmatch(n) for p in patterns)}
+            wanted = patterns("topics", self.settings.topics)
+            chosen = {n: t for n, t in known.items() if any(p.fullmatch(n) for p in wanted)}
         elif self.settings.select == "all":
             chosen = {n: t for n, t in known.items() if n != "/clock"}
         else:
@@ -216,6 +214,9 @@ class ReplayNode(Node):
         except InputError as error:
             self.error = str(error)
             self.get_logger().fatal(self.error)
+        except Exception as error:
+            self.error = f"{type(error).__name__}: {error}"
+            raise
         finally:
             self.done.set()
 
@@ -322,7 +323,9 @@ class ReplayNode(Node):
         self.published += 1
 
     def _publish_clock(self) -> None:
-        if self._clock is not None and not self._stop.is_set():
+        if self._clock is None or self._stop.is_set():
+            return
+        with self._clock_lock:  # the timer and the thread must not overtake each other: time would go back
             msg = ClockMessage()
             msg.clock.sec, msg.clock.nanosec = divmod(self._now_ns, NANOSECONDS)
             self._clock.publish(msg)

@@ -22,10 +22,9 @@ from visualization_msgs.msg import Marker, MarkerArray
 from limbloc_ros.core.errors import InputError
 from limbloc_ros.core.flesh_mesh import flesh_mesh
 from limbloc_ros.core.pose import JOINT, JOINT_NAMES, STICK_BONES, Pose
+from limbloc_ros.core.synchroniser import NANOSECONDS as NANOSECONDS
 
 Array = NDArray[np.float64]
-
-NANOSECONDS = 1_000_000_000
 
 #: The flesh figure's triangles: 80 per part, round enough at arm's length and quick to send.
 FLESH_SUBDIVISIONS = 1

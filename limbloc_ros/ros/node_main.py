@@ -17,6 +17,9 @@ from rclpy.signals import SignalHandlerOptions
 
 from limbloc_ros.core.errors import LimblocError
 
+#: Exit code when a node refused its parameters or input: starting again would not help.
+REFUSED = 2
+
 
 def make_executor(context: Context | None = None) -> Executor:
     """The events executor, five times cheaper per callback, where rclpy has it; else the single-threaded one."""
@@ -90,7 +93,7 @@ def main(
         until: True ends the process (a recording that has been replayed).
 
     Returns:
-        exit code: 0 after a clean stop, 1 when a node could not start (the reason is logged).
+        exit code: 0 after a clean stop, REFUSED when a node could not start (the reason is logged).
     """
     cv2.setNumThreads(1)  # one process per stage already uses the cores; OpenCV's pool only adds waiting
     nodes: Sequence[Node] = ()
@@ -114,7 +117,7 @@ def main(
         spin(nodes, until=lambda: stopped or (until is not None and until()))
     except LimblocError as error:
         get_logger("limbloc").fatal(str(error))
-        return 1
+        return REFUSED
     except KeyboardInterrupt:
         pass
     finally:

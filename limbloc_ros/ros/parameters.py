@@ -65,7 +65,8 @@ class NodeParameters:
             try:
                 self._node.declare_parameter(name, default, descriptor(field))
             except (InvalidParameterTypeException, InvalidParameterValueException) as error:
-                hint = " (write 1.0, not 1)" if isinstance(field.default, float) else ""
+                floats = hints[field.name] in (float, tuple[float, ...])
+                hint = " (write 1.0, not 1)" if floats else ""
                 raise ConfigError(f"parameter {name}: {error}; expected {_expected(field)}{hint}") from error
         values = {name: self._node.get_parameter_or(name).value for name in names}
         section = _Section(kind, names, _build(kind, names, values), on_change)

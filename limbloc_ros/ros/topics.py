@@ -18,7 +18,11 @@ them; who stays behind skips whole frames and says so (`backlog`), so that nothi
 
 from __future__ import annotations
 
+import re
+
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+
+from limbloc_ros.core.errors import ConfigError
 
 # --- per camera ---
 
@@ -101,6 +105,14 @@ def body_joint_angles(body_id: str) -> str:
 def body_frame(body_id: str) -> str:
     """TF frame of a person: mid-hips, x forward, z to the head."""
     return f"body_{body_id}"
+
+
+def patterns(parameter: str, texts: tuple[str, ...]) -> list[re.Pattern[str]]:
+    """Regular expressions of topic names; raises ConfigError, naming the parameter, when one is none."""
+    try:
+        return [re.compile(text) for text in texts]
+    except re.error as error:
+        raise ConfigError(f"parameter {parameter}: {error.pattern!r} is no regular expression ({error})") from error
 
 
 # --- services, below the node's own name ---
