@@ -34,7 +34,7 @@ first steps:
   limbloc process DIR --rig rig.yaml --out out/walk     poses of a folder of videos, one per camera
   limbloc COMMAND --help                                options and examples of a command
 
-Exit codes: 0 done, 2 wrong input (one line says what was expected), 130 interrupted.
+Exit codes: 0 done, 1 something failed on the way, 2 wrong input (one line says what was expected), 130 interrupted.
 """
 
 EXIT_INPUT, EXIT_INTERRUPTED = 2, 130

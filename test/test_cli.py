@@ -55,6 +55,9 @@ def test_without_a_command_it_shows_the_help(capsys):
         (["process", str(CASE), "--out", "x.npz", "--report"], "--report needs a folder"),
         (["process", str(CASE), "--config", "nowhere.yaml"], "parameters file nowhere.yaml does not exist"),
         (["report", "nowhere"], "holds no finished run"),
+        (["demo", "--cameras", "1"], "--cameras: expected 2 to 16, got 1"),
+        (["demo", "--people", "9"], "--people: expected 1 to 4, got 9"),
+        (["demo", "--rate", "0"], "--rate: expected 0.1 to 120, got 0"),
     ],
 )
 def test_wrong_input_is_one_line_and_exit_code_2(arguments, message, capsys, tmp_path, monkeypatch):

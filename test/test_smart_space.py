@@ -165,6 +165,7 @@ def test_plan_for_a_bag_of_masks_needs_no_segmentation(tmp_path):
         ("processes: 4", ConfigError, r"processes: expected a section"),
         ("network: {discovery: internet}", ConfigError, r"discovery: expected one of localhost, subnet, environment"),
         ("cameras: cam0", ConfigError, r"cameras: expected a list of names, got 'cam0'"),
+        ("cameras: 8", ConfigError, r"cameras: expected a list of names, got 8"),
         ("[1, 2]", ConfigError, r"expected keys such as source and rig, got list"),
         ("a: [", ConfigError, r"room.yaml, line \d: not valid YAML"),
         ("source: cameras", ConfigError, r"rig: expected a rig file for source cameras"),

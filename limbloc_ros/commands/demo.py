@@ -10,7 +10,7 @@ import time
 from datetime import datetime
 from pathlib import Path
 
-from limbloc_ros.core.errors import InputError
+from limbloc_ros.core.errors import ConfigError, InputError
 from limbloc_ros.ros.process_starter import SERVER
 
 DESCRIPTION = """\
@@ -44,7 +44,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--cameras", type=int, default=8, metavar="N", help="2 to 16 (default: 8)")
     parser.add_argument("--rate", type=float, default=10.0, metavar="HZ", help="images per second (default: 10)")
-    parser.add_argument("--person", choices=("man", "woman", "child", "heavy"), default="man", help="who moves")
+    parser.add_argument(
+        "--person", choices=("man", "woman", "child", "heavy"), default="man", help="who moves (default: man)"
+    )
     parser.add_argument("--people", type=int, default=1, metavar="N", help="how many, 1 to 4 (default: 1)")
     parser.add_argument(
         "--together",
@@ -63,6 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Do it."""
+    check(args)
     out = args.out or Path("out") / f"demo-{datetime.now():%Y%m%d-%H%M%S}"
     if (out / "bag").exists():
         raise InputError(f"{out} holds a demo already; choose another --out or remove it")
@@ -76,6 +79,19 @@ def run(args: argparse.Namespace) -> int:
     return main(
         ["process", str(out / "bag"), "--rig", str(out / "rig.yaml"), "--out", str(out), "--temporal", "--report"]
     )
+
+
+def check(args: argparse.Namespace) -> None:
+    """Raise ConfigError for a number that makes no sense, before anything is started."""
+    for option, value, low, high in (
+        ("--seconds", args.seconds, 1, 86400),
+        ("--cameras", args.cameras, 2, 16),
+        ("--rate", args.rate, 0.1, 120),
+        ("--people", args.people, 1, 4),
+        ("--domain", 0 if args.domain is None else args.domain, 0, 232),
+    ):
+        if not low <= value <= high:
+            raise ConfigError(f"{option}: expected {low:g} to {high:g}, got {value:g}")
 
 
 def _run_live(args: argparse.Namespace, out: Path) -> None:
@@ -122,7 +138,8 @@ def _run_live(args: argparse.Namespace, out: Path) -> None:
 
     def say(line: str) -> None:
         print(line, file=log, flush=True)
-        if line.startswith(f"[{SERVER}]"):  # the first start of all takes long, and it says why
+        # The first start of all takes long, and says why; a node that cannot run says why, too.
+        if line.startswith(f"[{SERVER}]") or "[FATAL]" in line:
             print(line)
 
     # The supervisor ends all children on the way out, whatever happens.

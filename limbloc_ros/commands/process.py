@@ -65,7 +65,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--temporal",
         action=argparse.BooleanOptionalAction,
         default=None,
-        help="start each frame from the one before: faster and smoother, but one process",
+        help="start each frame from the one before: faster and smoother, but one process (default: no)",
     )
     parser.add_argument("--jobs", type=int, default=0, metavar="N", help="processes (default: one per core)")
     parser.add_argument("--config", type=Path, metavar="YAML", help="parameters, see docs/parameters.md")

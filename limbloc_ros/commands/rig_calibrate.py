@@ -63,14 +63,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "[:legacy] (squares)",
     )
     parser.add_argument("--print-board", type=Path, metavar="PNG", help="only write the board as a picture to print")
-    parser.add_argument("--out", type=Path, default=Path("rig.yaml"), help="rig file to write (default: rig.yaml)")
+    parser.add_argument(
+        "--out", type=Path, help="rig file to write (default: rig.yaml), or folder with --intrinsics-only (lenses)"
+    )
     parser.add_argument(
         "--report", type=Path, metavar="DIR", help="folder of the report (default: beside the rig file)"
     )
     parser.add_argument("--cameras", nargs="+", metavar="CAM", help="only these (default: all in RECORDING)")
     parser.add_argument("--lens", choices=LENSES, default="radtan", help="lens model (default: radtan, k1 k2 p1 p2)")
     parser.add_argument("--intrinsics", type=Path, metavar="DIR", help="another recording, for the lenses only")
-    parser.add_argument("--intrinsics-only", action="store_true", help="lenses only: --out is a folder of ROS YAMLs")
+    parser.add_argument("--intrinsics-only", action="store_true", help="lenses only: a ROS YAML of each camera")
     parser.add_argument("--every", type=int, metavar="N", help=f"look at every N-th set (default: {MOST_SETS} in all)")
     parser.add_argument("--floor", type=int, nargs="+", metavar="FRAME", help="frames with the board on the floor")
     parser.add_argument("--thickness", type=float, default=0.0, metavar="METRES", help="of the board on the floor")
@@ -96,9 +98,10 @@ def run(args: argparse.Namespace) -> int:
         )
     if args.every is not None and args.every < 1:
         raise ConfigError(f"--every: expected 1 or more, got {args.every}")
+    out = args.out or Path("lenses" if args.intrinsics_only else "rig.yaml")
     views, sizes = find_boards(args.recording, names, board, args.every)
     if args.intrinsics_only:
-        return _lenses_only(args, board, names, sizes, views)
+        return _lenses_only(args, out, board, names, sizes, views)
     lens_views: list[View] = []
     if args.intrinsics:
         lens_views, more = find_boards(args.intrinsics, names, board, args.every)
@@ -114,15 +117,15 @@ def run(args: argparse.Namespace) -> int:
         lens=args.lens, lens_views=lens_views, floor=args.floor, thickness_m=args.thickness,
     )  # fmt: skip
     rig = Rig(result.cameras, *derive_volume(result.cameras))
-    save_rig(rig, args.out)
+    save_rig(rig, out)
     qualities = assess(result)
     advice = what_to_record(qualities, len(result.floor_frames))
-    folder = args.report or args.out.with_name(f"{args.out.stem}_calibration")
+    folder = args.report or out.with_name(f"{out.stem}_calibration")
     print(describe(rig))
     print(quality_table(qualities))
     _say(result.dropped, advice, result.floor_frames)
     page = write_report(result, rig, qualities, advice, folder, args.board)
-    print(f"rig file: {args.out}\nreport: {page}")
+    print(f"rig file: {out}\nreport: {page}")
     return 0
 
 
@@ -156,6 +159,7 @@ def find_boards(
 
 def _lenses_only(
     args: argparse.Namespace,
+    out: Path,
     board: Board,
     names: Sequence[str],
     sizes: dict[str, tuple[int, int]],
@@ -166,7 +170,7 @@ def _lenses_only(
             raise RigError(f"{args.recording}: no image of camera {name} can be read")
         mine = [view for view in views if view.camera == c]
         camera, used, residuals, dropped = calibrate_lens(name, sizes[name], mine, board, args.lens)
-        write_intrinsics(camera, args.out / f"{name}.yaml")
+        write_intrinsics(camera, out / f"{name}.yaml")
         one = Calibration((camera,), used, residuals, np.zeros(1), np.zeros(1), {}, [], dropped)
         quality = assess(one)
         K = camera.K
@@ -176,7 +180,7 @@ def _lenses_only(
             f"distortion {camera.distortion.round(4).tolist()}"
         )
         _say(dropped, what_to_record(quality, 0, alone=True), [])
-    print(f"lenses: {args.out}")
+    print(f"lenses: {out}")
     return 0
 
 

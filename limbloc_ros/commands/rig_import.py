@@ -11,7 +11,7 @@ from typing import TypeVar
 import numpy as np
 
 from limbloc_ros.core.camera import Rig
-from limbloc_ros.core.errors import ConfigError, InputError, OutputError
+from limbloc_ros.core.errors import ConfigError, InputError
 from limbloc_ros.recordings.bag_calibration import bag_intrinsics, bag_transforms
 from limbloc_ros.recordings.bags import is_bag
 from limbloc_ros.recordings.videos import VIDEO_SUFFIXES, ImageFolder, Stream, Video, pictures_in
@@ -133,8 +133,6 @@ def run(args: argparse.Namespace) -> int:
     rig, said = settle(
         reading, Wishes(args.unit, args.direction, args.up, args.floor, heights, sizes, args.fit, names, volume)
     )
-    if not args.out.parent.is_dir():
-        raise OutputError(f"--out {args.out}: the folder {args.out.parent} does not exist")
     save_rig(rig, args.out)
     print("\n".join(f"  {line}" for line in said))
     print(describe(rig))

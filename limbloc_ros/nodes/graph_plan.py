@@ -99,8 +99,8 @@ def config_from_mapping(values: Mapping[str, Any]) -> SmartSpaceConfig:
     """The config from plain values; raises ConfigError that names the key."""
     values = {key: {} if value is None else value for key, value in values.items()}
     cameras = values.get("cameras", ())
-    if isinstance(cameras, (str, bytes)) or not all(isinstance(name, str) for name in cameras):
-        raise ConfigError(f"cameras: expected a list of names, got {cameras!r}")
+    if not isinstance(cameras, (list, tuple)) or not all(isinstance(name, str) for name in cameras):
+        raise ConfigError(f"cameras: expected a list of names, got {cameras!r:.80}")
     values["cameras"] = tuple(cameras)
     return from_mapping(SmartSpaceConfig, values)
 

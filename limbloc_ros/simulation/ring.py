@@ -30,7 +30,7 @@ def default_rig(n_cameras: int = 8, width: int = 640, height: int = 480) -> Rig:
         RigError: a number of cameras or an image size that is out of range.
     """
     if not 2 <= n_cameras <= 16:
-        raise RigError(f"n_cameras: expected 2 to 16, got {n_cameras}")
+        raise RigError(f"number of cameras: expected 2 to 16, got {n_cameras}")
     if not (64 <= width <= 8192 and 64 <= height <= 8192):
         raise RigError(f"image size: expected 64 to 8192 px on a side, got {width}x{height}")
     cameras = []
