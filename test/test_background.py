@@ -15,7 +15,6 @@ from limbloc_ros.core.background import MOVED_PATIENCE, PATIENCE, BackgroundMode
 from limbloc_ros.core.background_estimate import estimate_background
 from limbloc_ros.core.config import BackgroundConfig
 from limbloc_ros.core.errors import ConfigError, InputError
-from limbloc_ros.core.mask_cleaning import clean_mask
 
 WALK = Path(__file__).parent / "data" / "rgb_walk"
 HEIGHT, WIDTH = 96, 128
@@ -63,11 +62,12 @@ def measured(image, mean, variance, gain=(1, 1, 1), floor=2.0, darkest=0.5, brig
     level = np.empty(planar[0].shape, dtype=np.uint16)
     sharpness = np.empty_like(level)
     kernels.fix_all(*planar, f(floor**2), f(1), level, sharpness)
-    change = np.empty(image.shape[:2], dtype=np.uint8)
-    colour = np.empty_like(change)
+    height, width = image.shape[:2]
+    change, colour = np.empty((2, height, width), dtype=np.uint8)
+    spans = np.tile(np.array([0, width], dtype=np.int32), (height, 1))
     kernels.measure(
         np.ascontiguousarray(image.transpose(2, 0, 1)), level, sharpness, np.array(gain, dtype=f), f(darkest),
-        f(brightest), change, colour,
+        f(brightest), spans, change, colour,
     )  # fmt: skip
     return change / kernels.CHANGE_SCALE, colour / kernels.COLOUR_SCALE
 
@@ -134,6 +134,35 @@ class TestKernels:
         assert np.abs(change - np.minimum(far, 127.5)).max() < 1.5 * unit[0]
         assert np.abs(colour - np.minimum(rest, 255 * unit[1])).max() < 1.5 * unit[1]
 
+    def test_only_spans_are_measured(self):
+        rng = np.random.default_rng(3)
+        shape = (3, 20, 700)
+        image = rng.integers(0, 256, shape, dtype=np.uint8)
+        level = rng.integers(0, 32000, shape, dtype=np.uint16)
+        sharpness = rng.integers(100, 2000, shape, dtype=np.uint16)
+        light = np.ones(3, dtype=np.float32), np.float32(0.5), np.float32(1.1)
+        everywhere = np.tile(np.array([0, 700], dtype=np.int32), (20, 1))
+        some = everywhere.copy()
+        some[3:9], some[9:] = (5, 420), (700, 0)
+        whole, part = np.zeros((2, 2, 20, 700), dtype=np.uint8)
+        kernels.measure(image, level, sharpness, *light, everywhere, *whole)
+        kernels.measure(image, level, sharpness, *light, some, *part)
+        columns = np.arange(700)
+        inside = (columns >= some[:, :1]) & (columns < some[:, 1:])
+        np.testing.assert_array_equal(part, np.where(inside, whole, 0))
+
+    def test_spans_of_foreground_by_hand(self):
+        change, colour = np.zeros((2, 40, 60), dtype=np.uint8)
+        change[8, 20:23] = colour[8, 20:23] = 50
+        change[9, 40:50] = colour[9, 40:50] = 50  # a row that is not looked at
+        change[16, 30] = colour[16, 30] = 50  # a single pixel: noise
+        change[24, 30:40] = 50  # a shadow
+        spans = np.empty((40, 2), dtype=np.int32)
+        kernels.foreground_spans(change, 8, colour, 16, 0, 4, 5, spans)
+        assert (spans[3:14] == (15, 28)).all()
+        assert (spans[:3] == (60, 0)).all()
+        assert (spans[14:] == (60, 0)).all()
+
     def test_learn(self):
         rng = np.random.default_rng(2)
         shape = (3, 24, 50)
@@ -189,38 +218,6 @@ class TestKernels:
         found = kernels.light_gain(black, black.astype(np.uint16), nobody, last, 1)
         np.testing.assert_array_equal(found, last)
 
-    @given(st.integers(0, 1000))
-    @settings(max_examples=25, deadline=None)
-    def test_hysteresis_keeps_whole_parts(self, seed):
-        rng = np.random.default_rng(seed)
-        weak = (rng.random((33, 47)) < 0.45).astype(np.uint8) * 255
-        weak[[0, -1]] = 0
-        weak[:, [0, -1]] = 0
-        strong = weak * (rng.random(weak.shape) < 0.03)
-        _, labels = cv2.connectedComponents(weak, connectivity=8)
-        kept = np.isin(labels, np.unique(labels[strong > 0])) & (weak > 0)
-        np.testing.assert_array_equal(kernels.grow_from_seeds(weak, strong.astype(np.uint8)) > 0, kept)
-
-    def test_body_parts_by_hand(self):
-        mask = np.zeros((12, 12), dtype=np.uint8)
-        mask[2:10, 2:10] = 255
-        mask[4:6, 4:6] = 0  # a hole: 8 border pixels' worth beside the mask, none beside background
-        mask[9, 6] = 0  # a notch: three sides mask, one background
-        changed = np.where(mask > 0, 50, 0).astype(np.uint8)
-        changed[4:6, 4:6] = 30
-        changed[9:11, 6] = 30  # the notch and one pixel that sticks out below it
-        colour = np.full_like(mask, 20)
-
-        def added(colour, ratio):
-            out = mask.copy()
-            kernels.add_body_parts(out, changed, colour, 8, 10.0, ratio)
-            return sorted(zip(*np.nonzero(out != mask), strict=True))
-
-        hole = [(4, 4), (4, 5), (5, 4), (5, 5)]
-        assert added(colour, 0.7) == [*hole, (9, 6), (10, 6)]  # 1 pixel beside the mask, 1 beside background
-        assert added(colour, 1.0) == hole
-        assert added(np.zeros_like(mask), 0.7) == []  # the background's very colour: a shadow
-
     def test_densest_mean_finds_the_crowd(self):
         rng = np.random.default_rng(4)
         samples = rng.integers(0, 256, (15, 5, 6, 3), dtype=np.uint8)
@@ -235,76 +232,6 @@ class TestKernels:
                 crowd = values[order[best : best + 6], y, x]
                 np.testing.assert_allclose(mean[y, x], crowd.mean(axis=0), rtol=1e-4)
                 np.testing.assert_allclose(sigma[y, x], crowd.std(axis=0), rtol=1e-2)
-
-
-class TestCleaning:
-    """Evidence drawn by hand at 640x480, where sizes in the configuration are plain pixels."""
-
-    def setup_method(self):
-        self.change = np.zeros((480, 640), dtype=np.uint8)
-        self.colour = np.zeros_like(self.change)
-
-    def draw(self, rows, columns, change_sigmas=30, colour_sigmas=20):
-        self.change[rows, columns] = change_sigmas * kernels.CHANGE_SCALE
-        self.colour[rows, columns] = colour_sigmas * kernels.COLOUR_SCALE
-
-    def mask(self, **kwargs):
-        return clean_mask(self.change, self.colour, BackgroundConfig(**kwargs)) > 0
-
-    def test_small_blobs_go_and_large_ones_stay(self):
-        self.draw(slice(100, 110), slice(100, 110))
-        self.draw(slice(200, 220), slice(100, 120))
-        mask = self.mask(min_blob_px=150)
-        assert not mask[90:120].any()
-        assert mask[200:220, 100:120].mean() > 0.98
-
-    def test_a_part_without_any_strong_pixel_is_nothing(self):
-        self.draw(slice(200, 250), slice(100, 150), colour_sigmas=3)
-        assert not self.mask().any()
-        self.draw(slice(220, 225), slice(120, 125), colour_sigmas=5)
-        assert self.mask()[200:250, 100:150].mean() > 0.98
-
-    @pytest.mark.parametrize(
-        ("size", "change", "colour", "filled"),
-        [
-            (8, 0, 0, True),  # too small to be seen through
-            (30, 0, 0, False),  # the background itself
-            (30, 30, 0.5, False),  # the background in the body's shadow
-            (30, 30, 1.6, True),  # nearly the background's colour: cloth
-        ],
-    )
-    def test_holes(self, size, change, colour, filled):
-        self.draw(slice(100, 300), slice(100, 200))
-        self.draw(slice(150, 150 + size), slice(130, 130 + size), change, colour)
-        inside = self.mask()[152 : 148 + size, 132 : 128 + size]
-        assert inside.all() if filled else not inside.any()
-
-    def test_a_bite_in_the_outline_is_body_and_a_cast_shadow_is_not(self):
-        self.draw(slice(100, 300), slice(100, 200))
-        self.draw(slice(150, 190), slice(100, 130), 30, 1.6)  # three sides body, one background
-        self.draw(slice(280, 300), slice(200, 300), 15, 1.6)  # touches the body with one short side
-        mask = self.mask()
-        assert mask[152:188, 102:130].all()
-        assert not mask[280:300, 205:].any()
-
-    def test_the_blurred_rim_is_trimmed(self):
-        self.draw(slice(98, 302), slice(98, 202), 12, 5)
-        self.draw(slice(100, 300), slice(100, 200), 60, 20)
-        truth = np.zeros((480, 640), dtype=bool)
-        truth[100:300, 100:200] = True
-        assert iou(self.mask(), truth) > 0.99
-        assert iou(self.mask(edge_fraction=0.0), truth) < 0.95
-
-    def test_a_faint_limb_beside_a_bright_trunk_stays(self):
-        self.draw(slice(100, 300), slice(100, 200), 60, 20)
-        self.draw(slice(150, 164), slice(200, 300), 6, 6)
-        assert self.mask()[152:162, 203:298].mean() > 0.98
-
-    def test_a_body_at_the_image_border_reaches_it(self):
-        self.draw(slice(300, 480), slice(0, 60))
-        mask = self.mask()
-        assert mask[479, 10:50].all()
-        assert mask[310:470, 0].all()
 
 
 class TestScenes:

@@ -33,6 +33,7 @@ CORE_ORDER = (
     "mask_png",
     "images",
     "synchroniser",
+    "background_evidence",
     "mask_cleaning",
     "segmentation",
     "relight",

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compiled loops of `background`: the per-pixel Gaussian test with its update, the light gain, and hysteresis.
+"""Compiled loops of `background`: the per-pixel Gaussian test with its update, and the light gain.
 
 The state is planar ([channel, height, width]) because the compiler then handles eight pixels at a time. What every
 frame reads of it is kept a second time in 16-bit fixed point: the loop over the image waits for memory, not for sums.
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 Bytes = NDArray[np.uint8]
 Words = NDArray[np.uint16]
 Floats = NDArray[np.float32]
+Spans = NDArray[np.int32]
 
 CHANGE_SCALE = 2.0
 """Grey levels of the change map per sigma (the map ends at 127 sigma)."""
@@ -40,10 +41,11 @@ def measure(
     gain: Floats,
     darkest: np.float32,
     brightest: np.float32,
+    spans: Spans,
     change: Bytes,
     colour: Bytes,
 ) -> None:
-    """Measure how far every pixel is from its background.
+    """Measure how far the pixels of some part of every row are from their background; the other ones stay.
 
     Args:
         image: [3, H, W] the frame, planar.
@@ -51,19 +53,22 @@ def measure(
         sharpness: [3, H, W] SHARPNESS_SCALE over the standard deviation.
         gain: [3] brightness of the light now over that of the model.
         darkest, brightest: shadows and highlights scale the background by a factor in this range.
+        spans: [H, 2] first column to measure of each row, and the one behind the last.
         change: [H, W] out, distance to the background in sigmas * CHANGE_SCALE.
         colour: [H, W] out, what of it no shadow or highlight explains, in sigmas * COLOUR_SCALE.
     """
-    height, width = change.shape
     top = np.float32(255)
     # Sums over the channels live in one scratch row at constant offsets: few pointers, so that the compiler can prove
     # that the loops may run on vectors. Their rounding (1e-2 sigma squared) is far below any threshold.
     scratch = np.empty(3 * STRIP, dtype=np.float32)
-    for y in range(height):
-        for start in range(0, width, STRIP):
-            n = min(STRIP, width - start)
-            for x in range(3 * STRIP):
+    for y in range(change.shape[0]):
+        end = spans[y, 1]
+        for start in range(spans[y, 0], end, STRIP):
+            n = min(STRIP, end - start)
+            for x in range(n):
                 scratch[x] = np.float32(0)
+                scratch[x + STRIP] = np.float32(0)
+                scratch[x + 2 * STRIP] = np.float32(0)
             for c in range(3):
                 pixel = image[c, y, start : start + n]
                 means = level[c, y, start : start + n]
@@ -184,6 +189,47 @@ def add_to_mean(image: Bytes, gain: Floats, count: int, mean: Floats, squares: F
 
 
 @njit(cache=True)
+def foreground_spans(
+    change: Bytes, threshold: int, colour: Bytes, colour_level: int, first: int, step: int, rim: int, spans: Spans
+) -> None:
+    """Where somebody may be, judged by the rows first, first + step, ...
+
+    Foreground is two neighbours of a row that both have this change and this colour: noise alters single pixels.
+
+    Args:
+        change, colour: [H, W] as `measure` gives them, for these rows at least.
+        threshold, colour_level: levels of foreground.
+        rim: pixels around foreground that belong to it, at least `step`.
+        spans: [H, 2] out, first column and the one behind the last, over all foreground of the rows around.
+    """
+    height, width = change.shape
+    spans[:, 0] = width
+    spans[:, 1] = 0
+    far, coloured = np.uint8(threshold), np.uint8(colour_level)
+    here = np.empty(width, dtype=np.uint8)
+    for y in range(first, height, step):
+        change_row, colour_row = change[y], colour[y]
+        # Most rows hold no foreground at all, which a loop without a way out finds out on vectors.
+        for x in range(width):
+            here[x] = np.uint8(change_row[x] >= far) & np.uint8(colour_row[x] >= coloured)
+        some = np.uint8(0)
+        for x in range(width - 1):
+            some |= here[x] & here[x + 1]
+        if some == 0:
+            continue
+        left = 0
+        while here[left] + here[left + 1] < 2:
+            left += 1
+        right = width
+        while here[right - 1] + here[right - 2] < 2:
+            right -= 1
+        left, right = max(left - rim, 0), min(right + rim, width)
+        for row in range(max(y - rim, 0), min(y + rim + 1, height)):
+            spans[row, 0] = min(spans[row, 0], left)
+            spans[row, 1] = max(spans[row, 1], right)
+
+
+@njit(cache=True)
 def light_gain(image: Bytes, level: Words, busy: Bytes, last: Floats, stride: int) -> Floats:
     """Brightness of the light per channel relative to the model: a median ratio, then a trimmed ratio of sums.
 
@@ -195,15 +241,18 @@ def light_gain(image: Bytes, level: Words, busy: Bytes, last: Floats, stride: in
     height, width = busy.shape
     gain = last.copy()
     bins = 1024
+    means = np.empty((height // stride + 1) * (width // stride + 1), dtype=np.float32)
+    values = np.empty_like(means)
     for c in range(3):
         counts = np.zeros(bins, dtype=np.int64)
         total = 0
         for y in range(stride // 2, height, stride):
             for x in range(stride // 2, width, stride):
                 m = np.float32(level[c, y, x]) * np.float32(1.0 / LEVEL_SCALE)
-                v = image[c, y, x]
+                v = np.float32(image[c, y, x])
                 if busy[y, x] == 0 and m > 20.0 and v < 250:
-                    counts[min(int(np.float32(v) / m * np.float32(256.0)), bins - 1)] += 1
+                    counts[min(int(v / m * np.float32(256.0)), bins - 1)] += 1
+                    means[total], values[total] = m, v
                     total += 1
         if total < 64:
             continue
@@ -215,112 +264,13 @@ def light_gain(image: Bytes, level: Words, busy: Bytes, last: Floats, stride: in
         centre = (middle + 0.5) / 256.0
         top = 0.0
         bottom = 0.0
-        for y in range(stride // 2, height, stride):
-            for x in range(stride // 2, width, stride):
-                m = np.float32(level[c, y, x]) * np.float32(1.0 / LEVEL_SCALE)
-                v = image[c, y, x]
-                if busy[y, x] == 0 and m > 20.0 and v < 250 and abs(v - centre * m) <= 0.08 * centre * m + 2.0:
-                    top += v
-                    bottom += float(m)
+        for k in range(total):
+            if abs(values[k] - centre * means[k]) <= 0.08 * centre * means[k] + 2.0:
+                top += values[k]
+                bottom += means[k]
         if bottom > 0.0:
             gain[c] = min(max(top / bottom, 0.2), 5.0)
     return gain
-
-
-@njit(cache=True)
-def grow_from_seeds(weak: Bytes, strong: Bytes) -> Bytes:
-    """Keep the 8-connected parts of `weak` that hold a pixel of `strong` (hysteresis).
-
-    Args:
-        weak, strong: [H, W] C-contiguous, non-zero = set. The outermost pixels of `weak` must be zero, so that no
-            neighbour lies outside the array.
-
-    Returns:
-        [H, W] 0 or 255.
-    """
-    width = weak.shape[1]
-    out = np.zeros_like(weak)
-    flat_weak, flat_out, flat_strong = weak.ravel(), out.ravel(), strong.ravel()
-    size = flat_weak.size
-    stack = np.empty(size, dtype=np.int32)
-    # Almost all of `strong` is zero: eight pixels at a time are skipped.
-    words = flat_strong[: size - size % 8].view(np.uint64)
-    start = 0
-    while start < size:
-        if start % 8 == 0 and start // 8 < words.size and words[start // 8] == 0:
-            start += 8
-            continue
-        if flat_strong[start] != 0 and flat_weak[start] != 0 and flat_out[start] == 0:
-            depth = 1
-            stack[0] = start
-            flat_out[start] = 255
-            while depth > 0:
-                depth -= 1
-                at = np.int64(stack[depth])
-                for row in (at - width, at, at + width):
-                    for to in (row - 1, row, row + 1):
-                        if flat_weak[to] != 0 and flat_out[to] == 0:
-                            flat_out[to] = 255
-                            stack[depth] = to
-                            depth += 1
-        start += 1
-    return out
-
-
-@njit(cache=True)
-def add_body_parts(
-    mask: Bytes, changed: Bytes, colour: Bytes, threshold: int, least_colour: float, border_ratio: float
-) -> None:
-    """Add to `mask`, in place, the 4-connected changed parts outside it that are more body than shadow.
-
-    A part is body when its border pixels beside `mask` are more than `border_ratio` times those beside unchanged
-    background, its mean `colour` is above `least_colour`, and it does not touch the rim of the arrays.
-
-    Args:
-        mask: [H, W] 0 or 255.
-        changed, colour: [H, W] evidence; a pixel is changed at `threshold`.
-    """
-    height, width = mask.shape
-    seen = np.zeros((height, width), dtype=np.uint8)
-    part = np.empty(height * width, dtype=np.int32)
-    for y0 in range(height):
-        for x0 in range(width):
-            if changed[y0, x0] < threshold or mask[y0, x0] != 0 or seen[y0, x0] != 0:
-                continue
-            part[0] = y0 * width + x0
-            seen[y0, x0] = 1
-            size = 1
-            done = 0
-            inner = 0
-            outer = 0
-            total = 0
-            at_rim = False
-            while done < size:
-                y, x = part[done] // width, part[done] % width
-                done += 1
-                total += colour[y, x]
-                if y == 0 or x == 0 or y == height - 1 or x == width - 1:
-                    at_rim = True
-                beside_mask = False
-                beside_background = False
-                for k in range(4):
-                    yy = y + (k == 0) - (k == 1)
-                    xx = x + (k == 2) - (k == 3)
-                    if yy < 0 or xx < 0 or yy >= height or xx >= width:
-                        continue
-                    if mask[yy, xx] == 255:
-                        beside_mask = True
-                    elif changed[yy, xx] < threshold:
-                        beside_background = True
-                    elif seen[yy, xx] == 0:
-                        seen[yy, xx] = 1
-                        part[size] = yy * width + xx
-                        size += 1
-                inner += beside_mask
-                outer += beside_background
-            if not at_rim and inner > border_ratio * outer and total > least_colour * size:
-                for k in range(size):
-                    mask[part[k] // width, part[k] % width] = 255
 
 
 @njit(cache=True)

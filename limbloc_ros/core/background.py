@@ -28,8 +28,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from limbloc_ros.core._background_kernels import CHANGE_SCALE, add_to_mean, fix_all, learn, light_gain, measure
+from limbloc_ros.core._background_kernels import add_to_mean, fix_all, learn, light_gain
 from limbloc_ros.core.background_estimate import BackgroundEstimate, estimate_background, fixed_levels, noise_variance
+from limbloc_ros.core.background_evidence import change_level, measure_evidence
 from limbloc_ros.core.config import BackgroundConfig, validated
 from limbloc_ros.core.errors import InputError
 from limbloc_ros.core.mask_cleaning import clean_mask
@@ -56,8 +57,8 @@ SWITCHED = 0.15
 MOVED_PATIENCE = 10
 """While a camera shows another view, every so many frames it is looked whether only the light has changed as well."""
 
-LEARNED_ROWS = 8
-"""Every row of pixels learns from every eighth image, with a rate to match: the same background in less time."""
+LEARNED_ROWS = 16
+"""Every row of pixels learns from every 16th image, with a rate to match: the same background in less time."""
 
 RESTLESS_SIGMA, UNREST = 10.0, 0.005
 """A pixel that varied more than this (grey levels) while the background was learned was not empty; and the share of
@@ -92,6 +93,7 @@ class BackgroundModel:
         self._gain = _ONES
         self._busy = np.zeros((0, 0), dtype=np.uint8)
         self._changed = self._busy
+        self._evidence = np.zeros((2, 0, 0), dtype=np.uint8)
         self._share, self._doubts = 0.0, 0
         self._fresh = True  # no image has been segmented yet: somebody may be there whom we never saw
         self._learned = 0
@@ -321,8 +323,8 @@ class BackgroundModel:
         return np.asarray(cv2.threshold(smooth, 127, 255, cv2.THRESH_BINARY)[1], dtype=np.uint8)
 
     def _stride(self) -> int:
-        """Sampling of the gain: about 3000 pixels whatever the image's size."""
-        return max(1, int(np.sqrt(self._mean[0].size / 3000.0)))
+        """Sampling of the gain: about 1500 pixels whatever the image's size."""
+        return max(1, int(np.sqrt(self._mean[0].size / 1500.0)))
 
     def _no_mask(self, light_jump: bool = False, moved: bool = False, blind: bool = False) -> Segmentation:
         assert self._image_shape is not None
@@ -374,15 +376,13 @@ class BackgroundModel:
         return np.float32(1 / 3 if self._grey else 1), np.float32(self._config.sigma_floor**2)
 
     def _measure(self, planes: Bytes) -> tuple[Bytes, Bytes]:
-        darkest, brightest = self._config.shadow_darkest, self._config.highlight_brightest
-        if self._grey:
-            darkest = brightest = 1.0
-        change = np.empty(planes.shape[1:], dtype=np.uint8)
-        colour = np.empty_like(change)
-        measure(
-            planes, self._level, self._sharpness, self._gain, np.float32(darkest), np.float32(brightest), change, colour
-        )
-        return change, colour
+        """Change and colour [h, w] of an image."""
+        if self._evidence.shape[1:] != planes.shape[1:]:
+            self._evidence = np.empty((2, *planes.shape[1:]), dtype=np.uint8)
+        model = self._level, self._sharpness, self._gain
+        most = min(max(PARTLY, 1.5 * self._share), FITS)
+        measure_evidence(planes, *model, self._config, self._grey, self._turn, most, *self._evidence)
+        return self._evidence[0], self._evidence[1]
 
     def _follow(self, planes: Bytes, change: Bytes) -> None:
         """Let the background pixels of this image's share of rows learn."""
@@ -396,7 +396,7 @@ class BackgroundModel:
             self._gain,
             self._busy,
             change,
-            np.float32(round(self._config.threshold_sigmas * CHANGE_SCALE)),
+            np.float32(change_level(self._config)),
             np.float32(1.0 - (1.0 - self._config.learning_rate) ** LEARNED_ROWS),
             floor,
             weight,
@@ -407,8 +407,7 @@ class BackgroundModel:
 
     def _far(self, change: Bytes) -> tuple[Bytes, float]:
         """Where the image is not the background [h, w], and the share of it."""
-        threshold = round(self._config.threshold_sigmas * CHANGE_SCALE)
-        far = np.asarray(cv2.compare(change, threshold, cv2.CMP_GE), dtype=np.uint8)
+        far = np.asarray(cv2.compare(change, change_level(self._config), cv2.CMP_GE), dtype=np.uint8)
         return far, cv2.countNonZero(far) / far.size
 
     def _partly_jumped(self, planes: Bytes, far: Bytes, share: float) -> bool:
