@@ -148,6 +148,18 @@ def test_an_archive_that_claims_a_billion_numbers_takes_no_memory(tmp_path):
     assert "its header claims [1000000000] float64, but 32 bytes are there" in said
 
 
+def test_an_archive_whose_directory_claims_more_than_the_file_takes_no_memory():
+    said = limited(
+        """
+        try:
+            npz_file.read_npz(Path(sys.argv[1]))
+        except LimblocError as error:
+            print(error)
+        """, CORPUS / "background" / "MemoryError_84ef17",
+    )  # fmt: skip
+    assert "its directory claims" in said
+
+
 def test_a_bag_whose_record_claims_a_gigabyte_takes_no_memory():
     said = limited(
         """

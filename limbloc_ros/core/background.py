@@ -219,7 +219,7 @@ class BackgroundModel:
             height, width = (int(n) for n in state["image_shape"])
             flags = [bool(state[key]) for key in ("grey", "noise_known", "frozen")]
             learned, max_pixels = int(state["learned"]), int(state["max_pixels"])
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise InputError(f"expected a saved background, got something else ({error})") from None
         fits = mean.ndim == 3 and mean.shape[0] == 3 and variance.shape == mean.shape and gain.shape == (3,)
         if not fits or max_pixels != self._config.max_pixels:

@@ -22,6 +22,8 @@ from limbloc_ros.core.errors import InputError
 
 #: All arrays of an archive together, unpacked: 3.5 hours of eight cameras' masks at 640x480 and 1 Hz.
 MOST_BYTES = 4 * 2**30
+#: Of an error's text, so many characters are told.
+LONGEST = 300
 #: Booleans, whole numbers, floats and texts; neither objects nor records.
 _KINDS = "biufU"
 
@@ -38,10 +40,14 @@ def read_npz(path: Path) -> dict[str, NDArray[Any]]:
             size = sum(member.file_size for member in members)
             if size > MOST_BYTES:
                 raise InputError(f"{path} would unpack to {size} bytes; expected at most {MOST_BYTES}")
+            packed, held = sum(member.compress_size for member in members), path.stat().st_size
+            if packed > held:
+                raise ValueError(f"its directory claims {packed} bytes of arrays, but the file has {held}")
             return {m.filename.removesuffix(".npy"): _array(archive, m) for m in members}
     # RuntimeError: encrypted; NotImplementedError: an unknown compression
     except (OSError, ValueError, RuntimeError, EOFError, zipfile.BadZipFile, zlib.error, lzma.LZMAError) as error:
-        raise InputError(f"{path} cannot be read as an .npz archive ({error}); copy it again") from None
+        # zipfile quotes what it finds in the place of a name, however long
+        raise InputError(f"{path} cannot be read as an .npz archive ({str(error)[:LONGEST]}); copy it again") from None
 
 
 def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[Any]:
