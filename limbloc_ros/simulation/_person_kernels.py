@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Kernels of `person` and `retarget`: linear blend skinning, and link rotations -> bone rotations.
 
-`test/test_simulation.py` holds the plain numpy reference of the skinning.
+`test/test_simulated_person.py` holds the plain numpy reference of the skinning.
 """
 
 from __future__ import annotations
