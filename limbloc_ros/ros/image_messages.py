@@ -92,13 +92,19 @@ def info_to_camera(msg: CameraInfo, name: str, T_world_camera: ArrayLike) -> Cam
     """A CameraInfo and the pose of its optical frame -> camera of the image that is sent (with ROI and binning).
 
     Raises:
-        RigError: an all-zero K, an unknown distortion model, a wrong number of coefficients, no size.
+        RigError: an all-zero K, an unknown distortion model or none for the coefficients that are there, a wrong number
+            of coefficients, no size.
     """
     models = {"plumb_bob": "radtan", "rational_polynomial": "rational", "equidistant": "fisheye", "": "none"}
     if msg.distortion_model not in models:
         raise RigError(
             f"camera {name}: distortion_model of its CameraInfo must be one of "
             f"{', '.join(filter(None, models))}, got {msg.distortion_model!r}"
+        )
+    if any(msg.d) and not msg.distortion_model:
+        raise RigError(
+            f"camera {name}: its CameraInfo has {len(msg.d)} coefficients but no distortion_model; expected one of "
+            f"{', '.join(filter(None, models))}"
         )
     model = models[msg.distortion_model] if any(msg.d) else "none"
     K = np.array(msg.k, dtype=np.float64).reshape(3, 3)
