@@ -1,256 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The energy: every term's gradient against finite differences, and eq. 2 on balls."""
+"""What the terms of the energy mean, worked by hand; eq. 2 on balls and people."""
 
 import dataclasses
 
 import figure_poses
 import numpy as np
 import pytest
+from energy_cases import BARE, NOTHING, VOXEL, a_person, entangled, only, ray_distances, turned_from_rest
 
 from limbloc_ros.core import energy, figure
-from limbloc_ros.core.energy import Evidence, Weights
+from limbloc_ros.core.energy import Weights
 from limbloc_ros.core.figure import BONE, FigureState, place
 from limbloc_ros.core.hull import Hull
-from limbloc_ros.core.pose import Flesh
-
-NOTHING = Weights(
-    surface=0.0, inclusion=0.0, penetration=0.0, posture=0.0, limits=0.0, spine=0.0, proportions=0.0, clothing=0.0
-)
-VOXEL = 0.02
-
-
-def only(**weights):
-    return dataclasses.replace(NOTHING, **weights)
-
-
-def flesh_grid(state, margin_m=0.3):
-    """The signed distance of a person's own flesh on a lattice: float32 grid and its origin."""
-    placed = place(state)
-    low = np.floor((placed.spheres.min(axis=0) - margin_m) / VOXEL).astype(int)
-    high = np.ceil((placed.spheres.max(axis=0) + margin_m) / VOXEL).astype(int)
-    index = np.stack(np.meshgrid(*(np.arange(a, b) for a, b in zip(low, high, strict=True)), indexing="ij"), axis=-1)
-    centres = (index + 0.5) * VOXEL
-    d, _ = figure.flesh_distance(centres.reshape(-1, 3), placed.flesh())
-    return d.reshape(index.shape[:3]).astype(np.float32), (low + 0.5) * VOXEL
-
-
-def surface_points(state, count, rng):
-    """Points on a person's skin and their normals."""
-    placed = place(state)
-    flesh = placed.flesh()
-    direction = rng.normal(size=(20 * count, 3))
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    s = rng.integers(0, figure.N_SPHERES, len(direction))
-    points = placed.spheres[s] + placed.radii[s, None] * direction
-    outer = np.abs(figure.flesh_distance(points, flesh)[0]) < 1e-9
-    return points[outer][:count], direction[outer][:count]
-
-
-def evidence_of(state, rng, count=200):
-    points, normals = surface_points(state, count, rng)
-    weights = rng.uniform(0.5, 1.5, len(points))
-    sdf, origin = flesh_grid(state)
-    return Evidence(points, normals, np.zeros_like(points), weights / weights.sum(), sdf, origin, VOXEL)
-
-
-def size(state):
-    return 3 + figure.N_DOF + len(state.shape)
-
-
-def ray_distances(points, rays, placed):
-    """Signed distance [Q] of rays (points where they are zero) to the flesh: that of circles, seen along the ray."""
-    out = np.empty(len(points))
-    for q, (point, ray) in enumerate(zip(points, rays, strict=True)):
-        flat = placed.spheres - np.outer((placed.spheres - point) @ ray, ray)
-        flesh = Flesh(flat, placed.radii, figure.PART_SPHERES, figure.PART_NAMES)
-        out[q] = figure.flesh_distance(point[None], flesh)[0][0]
-    return out
 
 
 @pytest.fixture(scope="module")
 def case():
-    """A person's evidence, and the same person a little off."""
-    rng = np.random.default_rng(0)
-    truth = figure_poses.random_state(rng, 0.5)
-    step = 0.1 * rng.normal(size=size(truth))
-    step[:3] *= 0.3
-    step[3 + figure.N_DOF] *= 0.3
-    return truth, evidence_of(truth, rng), truth.moved(step)
-
-
-@pytest.fixture(scope="module")
-def seen(case):
-    """The same case, but three of four points are asked for along some ray only that touches the skin there."""
-    truth, evidence, state = case
-    rays = np.cross(evidence.normals, np.random.default_rng(5).normal(size=evidence.points.shape))
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    rays[::4] = 0.0
-    assert rays.any(axis=1).sum() > 100
-    return truth, dataclasses.replace(evidence, rays=rays), state
-
-
-def finite_difference(state, evidence, weights, h=1e-6):
-    """The cost's derivative, by central differences of `moved`."""
-    unit = np.eye(size(state))
-    return np.array(
-        [
-            energy.system(state.moved(h * e), evidence, weights).cost
-            - energy.system(state.moved(-h * e), evidence, weights).cost
-            for e in unit
-        ]
-    ) / (2 * h)
-
-
-# derivatives
-
-TERMS = {
-    "surface": only(surface=1.0, normal_gate_m=0.0),
-    "gated surface": only(surface=1.0),
-    "inclusion": only(inclusion=1.0),
-    "penetration": only(penetration=1.0),
-    "proportions": only(proportions=1.0),
-}
-
-
-@pytest.mark.parametrize("name", TERMS)
-def test_gradient_of_a_term(case, name):
-    _, evidence, state = case
-    if name == "penetration":
-        state = entangled()
-    system = energy.system(state, evidence, TERMS[name])
-    assert system.cost > 0
-    numeric = finite_difference(state, evidence, TERMS[name])
-    np.testing.assert_allclose(2 * system.gradient, numeric, atol=1e-6 * np.abs(numeric).max())
-
-
-@pytest.mark.parametrize("name", ["surface", "gated surface"])
-def test_gradient_of_the_surface_term_along_rays(seen, case, name):
-    _, evidence, state = seen
-    system = energy.system(state, evidence, TERMS[name])
-    assert system.cost > 0
-    assert system.cost != pytest.approx(energy.system(state, case[1], TERMS[name]).cost, rel=0.01)
-    numeric = finite_difference(state, evidence, TERMS[name])
-    np.testing.assert_allclose(2 * system.gradient, numeric, atol=1e-6 * np.abs(numeric).max())
-
-
-def entangled():
-    """Someone whose arms and legs run through each other."""
-    rng = np.random.default_rng(1)
-    people = [figure_poses.random_state(rng) for _ in range(30)]
-    return max(people, key=lambda state: energy.system(state, BARE, TERMS["penetration"]).cost)
-
-
-AIR = np.ones((3, 3, 3), np.float32)
-BARE = Evidence(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), AIR, np.zeros(3), VOXEL)
-
-
-@pytest.mark.parametrize("name", ["posture", "limits"])
-def test_gradient_of_a_posture_term_by_each_joint_alone(name):
-    # Exact when a bone turns about one axis only: then the turns do not mix.
-    rng = np.random.default_rng(2)
-    weights = only(**{name: 1.0})
-    axis = {}
-    for d in rng.permutation(figure.N_DOF):
-        axis.setdefault(int(figure.DOF_BONES[d]), int(d))
-    angles = np.zeros(figure.N_DOF)
-    alone = [d for bone, d in axis.items() if bone != BONE["pelvis"]]
-    angles[alone] = energy.HIGH[alone] + 0.1
-    state = turned_from_rest(angles)
-    numeric = finite_difference(state, BARE, weights)[[3 + d for d in alone]]
-    gradient = 2 * energy.system(state, BARE, weights).gradient[[3 + d for d in alone]]
-    assert np.abs(numeric).min() > 0
-    np.testing.assert_allclose(gradient, numeric, rtol=1e-5)
-
-
-@pytest.mark.parametrize("name", ["posture", "limits", "spine"])
-def test_gradient_of_a_posture_term_points_uphill(name):
-    # About several axes at once it leaves out how turns of one bone mix, yet a step against it must lower the cost.
-    rng = np.random.default_rng(2)
-    weights = only(**{name: 1.0})
-    for _ in range(10):
-        state = figure_poses.random_state(rng, 1.3)
-        numeric = finite_difference(state, BARE, weights)
-        gradient = 2 * energy.system(state, BARE, weights).gradient
-        assert gradient @ numeric > 0.4 * np.linalg.norm(gradient) * np.linalg.norm(numeric)
-
-
-def test_clothes_add_to_a_body_and_do_not_take_away():
-    first = figure.proportions().clothing_from
-    state = FigureState.standing(np.zeros(3), stature=1.7)
-    for amount, expected in ((0.5, 0.25), (2.0, 4.0), (-2.0, 25.0 * 4.0)):
-        state.shape[first] = amount
-        found = energy.system(state, BARE, only(clothing=1.0))
-        assert found.cost == pytest.approx(expected)
-        at = 3 + figure.N_DOF + first
-        assert 2.0 * found.gradient[at] == pytest.approx(finite_difference(state, BARE, only(clothing=1.0))[at])
-        assert energy.system(state, BARE, only(proportions=1.0)).cost == pytest.approx(
-            energy.system(FigureState.standing(np.zeros(3), stature=1.7), BARE, only(proportions=1.0)).cost
-        )
-
-
-def test_gradient_of_everything_but_posture(case):
-    _, evidence, state = case
-    weights = dataclasses.replace(Weights(), posture=0.0, limits=0.0, spine=0.0)
-    numeric = finite_difference(state, evidence, weights)
-    gradient = 2 * energy.system(state, evidence, weights).gradient
-    np.testing.assert_allclose(gradient, numeric, atol=1e-6 * np.abs(numeric).max())
-
-
-def test_matrix_is_symmetric_and_positive(case):
-    _, evidence, state = case
-    for weights in (*TERMS.values(), Weights()):
-        matrix = energy.system(state, evidence, weights).matrix
-        np.testing.assert_allclose(matrix, matrix.T, atol=1e-12 * np.abs(matrix).max())
-        assert np.linalg.eigvalsh(matrix).min() >= -1e-9 * np.abs(matrix).max()
-
-
-@pytest.mark.parametrize("along", ["points", "rays"])
-def test_matrix_of_the_surface_term_against_its_residuals(case, seen, along):
-    _, evidence, state = case if along == "points" else seen
-    wide = only(surface=1.0, normal_gate_m=0.0, surface_width_m=1e6, surface_inside=3.0)  # in effect no robustness
-
-    def residuals(step):
-        return ray_distances(evidence.points, evidence.rays, place(state.moved(step)))
-
-    h = 1e-6
-    J = np.stack([(residuals(h * e) - residuals(-h * e)) / (2 * h) for e in np.eye(size(state))], axis=1)
-    d = residuals(np.zeros(size(state)))
-    weight = evidence.point_weights * np.where(d < 0, 3.0, 1.0)
-    system = energy.system(state, evidence, wide)
-    assert (d < 0).any()
-    assert system.cost == pytest.approx((weight * d * d).sum(), rel=1e-6)
-    matrix = J.T @ (weight[:, None] * J)
-    np.testing.assert_allclose(system.matrix, matrix, atol=1e-6 * np.abs(matrix).max())
-    np.testing.assert_allclose(system.gradient, J.T @ (weight * d), atol=1e-6 * np.abs(J.T @ (weight * d)).max())
-
-
-def test_blocks_are_gathered_as_a_dense_product():
-    """Some parts without evidence, spheres that repeat within a part, parameters that move no part."""
-    rng = np.random.default_rng(6)
-    spheres, parameters = 9, 14
-    parts = np.array([[0, 1, 2], [3, 4, 4], [5, 5, 5], [6, 7, 8], [2, 3, 6]])
-    J = rng.normal(size=(spheres, 4, parameters)) * (rng.random((spheres, 1, parameters)) < 0.4)
-    J[:, :, [0, 5, 13]] = 0.0
-    J[2, :, 7] = [0.0, 0.0, 0.0, 0.3]  # only its radius changes
-    half = rng.normal(size=(len(parts), 12, 12))
-    full = half @ half.transpose(0, 2, 1)
-    full[3] = 0.0
-    slopes = rng.normal(size=(len(parts), 12)) * full.any(axis=(1, 2))[:, None]
-    dense, gradient = np.zeros((parameters, parameters)), np.zeros(parameters)
-    for part, block, slope in zip(parts, full, slopes, strict=True):
-        rows = J[part].reshape(12, parameters)
-        dense += rows.T @ block @ rows
-        gradient += rows.T @ slope
-    A, g = np.zeros((parameters, parameters)), np.zeros(parameters)
-    below = np.kron(np.tri(3, k=-1), np.ones((4, 4))) == 1.0  # which the terms leave out
-    energy.kernels.gather(np.where(below[None], 0.0, full), slopes, parts, J, A, g)
-    np.testing.assert_allclose(A, dense, atol=1e-12 * np.abs(dense).max())
-    np.testing.assert_allclose(g, gradient, atol=1e-12 * np.abs(gradient).max())
-    assert np.abs(dense).max() > 1
-    np.testing.assert_array_equal(A, A.T)
-
-
-# what the terms mean
+    return a_person()
 
 
 def test_the_true_figure_explains_its_own_surface(case):
@@ -421,11 +187,6 @@ def dof(bone, axis):
     """Index of a bone's turn about an axis."""
     rows = (figure.DOF_BONES - BONE[bone] == 0) & (figure.DOF_AXES[:, axis] > 0)
     return int(np.flatnonzero(rows)[0])
-
-
-def turned_from_rest(angles):
-    state = FigureState(np.zeros(3), energy.REST_ROTATIONS, FigureState.standing(np.zeros(3)).shape)
-    return state.moved(np.concatenate([np.zeros(3), angles, np.zeros(len(state.shape))]))
 
 
 def test_limits_worked_by_hand():
