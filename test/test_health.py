@@ -5,7 +5,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from pathlib import Path
 
+import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 from ros_graph import Graph
@@ -75,3 +77,22 @@ def test_bugs_are_not_swallowed(graph: Graph) -> None:
     reporter = health.Health(graph.tester, list)
     with pytest.raises(ZeroDivisionError), reporter.guard("x"):
         raise ZeroDivisionError
+
+
+def resident_mb() -> float:
+    status = Path("/proc/self/status").read_text()
+    return int(next(line.split()[1] for line in status.splitlines() if line.startswith("RssAnon"))) / 1024
+
+
+def test_what_a_harder_frame_needed_is_given_back_to_the_system(graph: Graph, monkeypatch: pytest.MonkeyPatch) -> None:
+    told = health.Health(graph.tester, lambda: [make_status("a", OK, "fine", {})])
+    blocks = [np.ones(12_500) for _ in range(1000)]  # of 100 KB: from the heap, not mappings of their own
+    kept = blocks[::50]
+    blocks.clear()
+    before = resident_mb()
+    told.publish()
+    assert resident_mb() > before - 10
+    monkeypatch.setattr(health, "GIVE_BACK_S", 0.0)
+    told.publish()
+    assert resident_mb() < before - 70
+    assert len(kept) == 20
