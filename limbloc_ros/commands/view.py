@@ -14,12 +14,13 @@ from limbloc_ros.export.recording import config_of, open_recording, recorded_fra
 from limbloc_ros.recordings.kept_frames import KeptFrames
 from limbloc_ros.recordings.results import Run
 from limbloc_ros.report.viewer_scene import COLOURS, LAYERS, Masks, Playback, RunScene
-from limbloc_ros.report.viewer_window import Window, load_open3d, write_picture
+from limbloc_ros.report.viewer_window import Window, load_open3d, require_display, write_picture
 
 DESCRIPTION = """\
 Look at a run that `limbloc process` or `limbloc demo` left in RUN: scrub through its frames or play them; switch hull,
-flesh figure, stick figure, path, cameras and floor on and off; colour the hull by geodesic distance or curvature. Needs
-the extra `viewer` (Open3D). The hull is there for the frames whose masks the run kept; with --recording for all.
+flesh figure, stick figure, path, cameras and floor on and off; colour the hull by geodesic distance or curvature.
+Around a figure a plain hull is drawn as level lines, a coloured one hides it. Needs the extra `viewer` (Open3D). The
+hull is there for the frames whose masks the run kept; with --recording for all.
 
 Keys: left and right step, space plays, home and end go to the ends; drag turns, ctrl-drag moves, the wheel zooms.
 """
@@ -48,6 +49,8 @@ def run(args: argparse.Namespace) -> int:
     result = Run.load(args.run)
     if not 0 <= args.frame < len(result):
         raise ConfigError(f"--frame: expected 0 to {len(result) - 1}, got {args.frame}")
+    if args.picture is None:
+        require_display()
     load_open3d()  # say at once when it is missing
     scene = RunScene(result, rig_of(args.run), _masks(args, result), config_of(result).hull)
     playback = Playback(len(result), result.stamps - result.stamps[0], colour=args.colour)

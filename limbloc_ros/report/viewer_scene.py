@@ -37,7 +37,13 @@ COLOURS = ("plain", "geodesic distance", "curvature")
 #: The pyramid of a camera reaches so far, m.
 FRUSTUM_M = 0.35
 FLOOR_STEP_M = 0.5
+#: Height between two of the lines that stand for the hull where the figure inside it is shown too, m.
+CONTOUR_STEP_M = 0.02
 _HULL_COLOUR = (0.62, 0.68, 0.75)
+_CONTOUR_COLOUR = (0.36, 0.42, 0.50)
+_AMBIENT = 0.55
+#: Towards the two lights, unit vectors times their strengths: above to one side, and weaker from the other.
+_LIGHTS = np.array([0.45 * np.array([0.58, 0.33, 0.74]), 0.15 * np.array([-0.74, -0.58, 0.33])])
 
 
 @dataclass(frozen=True)
@@ -92,18 +98,25 @@ class RunScene:
         self._carver = Carver(rig, config)
         self._hulls: dict[tuple[int, str], Mesh | None] = {}
 
-    def meshes(self, number: int, layers: Iterable[str], colour: str = COLOURS[0]) -> dict[str, Mesh]:
-        """The meshes of the wanted layers that this frame has: `hull`, `flesh`, `sticks`."""
+    def shapes(self, number: int, layers: Iterable[str], colour: str = COLOURS[0]) -> dict[str, Mesh | Lines]:
+        """What this frame has of the wanted layers `hull`, `flesh` and `sticks`.
+
+        A plain hull around a figure comes as level lines, so that the figure is seen in it; anything else as a mesh
+        with its shading in its colours. A hull whose colours mean something hides the figure.
+        """
         wanted = set(layers)
+        hull = self._hull(number, colour) if "hull" in wanted else None
+        if hull is not None and colour != COLOURS[0]:
+            return {"hull": shaded(hull)}
         pose = self.run.frames[number].outcome
-        found: dict[str, Mesh] = {}
-        if "hull" in wanted and (hull := self._hull(number, colour)) is not None:
-            found["hull"] = hull
+        found: dict[str, Mesh | Lines] = {}
         if isinstance(pose, Pose):
             if "flesh" in wanted:
-                found["flesh"] = flesh_figure_mesh(pose.flesh)
+                found["flesh"] = shaded(flesh_figure_mesh(pose.flesh))
             if "sticks" in wanted:
-                found["sticks"] = stick_mesh(pose.joints)
+                found["sticks"] = shaded(stick_mesh(pose.joints))
+        if hull is not None:
+            found["hull"] = contour_lines(hull) if found else shaded(hull)
         return found
 
     def lines(self, layers: Iterable[str]) -> dict[str, Lines]:
@@ -179,6 +192,17 @@ class Playback:
         if self.playing:
             self.go(0 if self.number == self.frames - 1 else self.number)
 
+    def press(self, key: str) -> bool:
+        """Do what a key is for; whether it is for anything. Keys: left, right, home, end, space."""
+        goals = {"left": self.number - 1, "right": self.number + 1, "home": 0, "end": self.frames - 1}
+        if key == "space":
+            self.toggle()
+        elif key in goals:
+            self.go(goals[key])
+        else:
+            return False
+        return True
+
     def tick(self, elapsed_s: float) -> bool:
         """Let time go on; whether another frame is to be shown. Slow drawing skips frames and keeps the pace."""
         if not self.playing:
@@ -210,6 +234,36 @@ def coloured_hull(hull: Hull, colour: str) -> Mesh:
         top = float(np.nanpercentile(values, 97))
     shaded = with_field(mesh, surface.points, values)
     return Mesh.of(mesh.vertices, mesh.faces, mesh.normals, np.asarray(colours(shaded.scalars / top))[:, :3])
+
+
+def shaded(mesh: Mesh) -> Mesh:
+    """The mesh with the light of the room in its colours.
+
+    Open3D's own lit materials are compiled for minutes where a processor draws; colours that hold the light already
+    need its simplest one, and look the same everywhere.
+    """
+    light = _AMBIENT + np.maximum(mesh.normals @ _LIGHTS.T, 0.0).sum(axis=1, keepdims=True)
+    return Mesh(mesh.vertices, mesh.faces, mesh.normals, np.minimum(mesh.colours * light, 1.0), mesh.scalars)
+
+
+def contour_lines(mesh: Mesh, step_m: float = CONTOUR_STEP_M) -> Lines:
+    """Where horizontal planes `step_m` apart cut a mesh."""
+    corners = mesh.vertices[mesh.faces]
+    height = corners[..., 2] / step_m
+    ends = [np.zeros((0, 3))]
+    for level in range(int(np.ceil(height.min(initial=0.0))), int(np.ceil(height.max(initial=0.0)))):
+        above = height >= level
+        cut = np.flatnonzero(above.any(axis=1) & ~above.all(axis=1))
+        lone = np.where(above[cut].sum(axis=1) == 1, above[cut].argmax(axis=1), above[cut].argmin(axis=1))
+        start, z = corners[cut, lone], height[cut, lone]
+        sides = []
+        for turn in (1, 2):
+            other = (lone + turn) % 3
+            part = (level - z) / (height[cut, other] - z)
+            sides.append(start + part[:, None] * (corners[cut, other] - start))
+        ends.append(np.stack(sides, axis=1).reshape(-1, 3))
+    points = np.concatenate(ends)
+    return Lines(points, np.arange(len(points), dtype=np.int64).reshape(-1, 2), _CONTOUR_COLOUR)
 
 
 def camera_lines(rig: Rig) -> Lines:
