@@ -81,7 +81,7 @@ class _Fault:
 def give_back_memory() -> None:
     """Return freed memory to the system, also from between blocks in use: without it a process only ever grows.
 
-    The C library keeps what was freed (`environment` asks it to, for speed). Returning it takes less than a millisecond.
+    The C library keeps what was freed (`environment` asks it to, for speed). Returning it takes below a millisecond.
     """
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
     if trim is not None:  # glibc has it, other C libraries do not
