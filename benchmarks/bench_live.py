@@ -43,7 +43,7 @@ START_S = 120.0
 #: What the diagnostics say about each stage, printed at the end: (end of the status' name, keys).
 SHOWN = (
     (": images", ("rate_hz", "render_ms", "frames", "frames_skipped")),
-    (": mask", ("rate_hz", "latency_ms", "segment_ms", "images", "images_skipped")),
+    (": mask", ("rate_hz", "latency_ms", "segment_ms", "images_segmented", "images_skipped")),
     (": hull", ("rate_hz", "latency_ms", "carve_ms", "sets_complete", "sets_incomplete", "sets_dropped",
                 "sets_skipped")),
     (": posture", ("rate_hz", "latency_ms", "surface_ms", "fit_ms", "hulls", "hulls_skipped")),

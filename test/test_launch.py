@@ -20,6 +20,8 @@ from limbloc_ros.ros.environment import share_folder
 ROOT = Path(limbloc_ros.__file__).parent.parent
 LAUNCH = ROOT / "launch" / "smart_space.launch.py"
 CONFIG = ROOT / "config"
+#: As the beginning of smart_space.yaml says.
+OTHER_THAN_THE_DEFAULT = {("pose", "fit.temporal"), ("simulated_cameras", "rate_hz")}
 
 
 def launch_arguments():
@@ -74,7 +76,9 @@ def test_every_parameter_in_the_installed_file_exists():
         for name, value in flatten(getattr(config, section)).items():
             leaf = name.rpartition(".")[2]
             assert leaf in known, f"{section}: {name}"
-            from_mapping(known[leaf], {leaf: value})  # right type and within its bounds
+            made = from_mapping(known[leaf], {leaf: value})  # right type and within its bounds
+            other = (section, name) in OTHER_THAN_THE_DEFAULT
+            assert (made == known[leaf]()) != other, f"{section}: {name}: the file says that it is the default"
 
 
 def test_node_sections_are_the_nodes():

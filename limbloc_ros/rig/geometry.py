@@ -47,6 +47,18 @@ def inverse(T: Array) -> Array:
     return out
 
 
+def rotation_of(quaternion: Array) -> Array:
+    """Rotation matrix [3, 3] of a quaternion x y z w of length 1."""
+    x, y, z, w = quaternion
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
 def looking_at(centre: Array, target: Array) -> Array:
     """T_world_camera [4, 4] of an upright camera at `centre` [3] that looks at `target` [3]."""
     forward = target - centre

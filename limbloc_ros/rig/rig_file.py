@@ -39,6 +39,7 @@ from numpy.typing import NDArray
 from limbloc_ros.core.camera import DISTORTION_COEFFICIENTS, Camera, Rig
 from limbloc_ros.core.errors import RigError
 from limbloc_ros.files import write_text
+from limbloc_ros.rig.geometry import rotation_of
 from limbloc_ros.rig.plain_values import kind, known_keys, numbers, parse, read_text, required
 from limbloc_ros.rig.volume import derive_volume
 
@@ -268,13 +269,8 @@ def _camera_pose(value: Any, at: str) -> Array:
         raise RigError(
             f"{at}.quaternion: expected x y z w of length 1, got {quaternion.tolist()} of length {length:.4g}"
         )
-    x, y, z, w = quaternion / length
     T = np.eye(4)
-    T[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
+    T[:3, :3] = rotation_of(quaternion / length)
     T[:3, 3] = numbers(required(value, "translation", at), (3,), f"{at}.translation")
     return T
 

@@ -23,6 +23,7 @@ from limbloc_ros.core.errors import InputError
 from limbloc_ros.core.flesh_mesh import flesh_mesh
 from limbloc_ros.core.pose import JOINT, JOINT_NAMES, STICK_BONES, Pose
 from limbloc_ros.core.synchroniser import NANOSECONDS as NANOSECONDS
+from limbloc_ros.rig.geometry import rotation_of
 
 Array = NDArray[np.float64]
 
@@ -173,12 +174,7 @@ def message_to_transform(msg: TransformStamped) -> Array:
             f"length 1, got {numbers.tolist()}"
         )
     T = np.eye(4)
-    x, y, z, w = numbers[3:] / length
-    T[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
+    T[:3, :3] = rotation_of(numbers[3:] / length)
     T[:3, 3] = numbers[:3]
     return T
 
