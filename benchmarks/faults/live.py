@@ -178,11 +178,12 @@ class Live:
             self.spin(0.1)
         self.cameras.filming = True
         self.stage.clear()
-        if not self.until(lambda: self.answers and not self.answers[-1].posed and self._learned(), 30.0):
+        # The first start of all compiles the kernels.
+        if not self.until(lambda: self.answers and not self.answers[-1].posed and self._learned(), START_S):
             return False
         self.spin(0.5)
         self.stage.enter()
-        return self.until_right(30.0)
+        return self.until_right(START_S)
 
     def _learned(self) -> bool:
         masks = [v for name, v in self.values.items() if name.endswith(": mask")]
