@@ -79,7 +79,7 @@ class Tracker:
         self._usual_cost = 0.0
         self._frame = 0
         self._last_scratch = -self.PATIENCE
-        self._wait = self.PATIENCE
+        self._wait, self._vain = self.PATIENCE, False
         self._centre = np.zeros(3)
         self._size, self._sized = np.zeros(0), 0
 
@@ -107,8 +107,11 @@ class Tracker:
             fit = Fit(final.state, final.system, judged=judged)
         if fit is None or self._doubts(fit.judged):
             self._last_scratch = self._frame
-            scratch = fit_from_scratch(hull, surface, self._seed, self._weights, self._searches)
-            if scratch is not None and (fit is None or scratch.judged < 0.95 * fit.judged):
+            # while there is a figure, a quick search first: what it misses is searched harder the next time
+            searches = self._searches if fit is None or self._vain else self._searches[:1]
+            scratch = fit_from_scratch(hull, surface, self._seed, self._weights, searches)
+            self._vain = scratch is None or (fit is not None and scratch.judged >= 0.95 * fit.judged)
+            if scratch is not None and not self._vain:
                 fit, self._wait = scratch, self.PATIENCE if scratch.judged < self.DOUBTFUL_COST else 1
                 self._size, self._sized = scratch.state.shape, 1
             else:
