@@ -8,8 +8,6 @@ begin with so many frames of the empty room, which the truth does not have: they
 
 from __future__ import annotations
 
-import os
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -71,8 +69,10 @@ def unpack_mask(packed: NDArray[np.uint8], width: int) -> NDArray[np.uint8]:
 
 def is_case(folder: Path) -> bool:
     """Whether `folder` is a benchmark case."""
-    # os.path: what is no path at all, only in a damaged file of results, is no case either
-    return all(os.path.isfile(folder / name) for name in ("calib.json", "masks.npz"))
+    try:
+        return (folder / "calib.json").is_file() and (folder / "masks.npz").is_file()
+    except OSError:  # no path at all, as a damaged file of results may hold
+        return False
 
 
 def load_case(folder: str | Path, rig: Rig | None = None) -> Case:
