@@ -3,9 +3,7 @@
 
 from __future__ import annotations
 
-import sys
 import time
-import types
 from array import array
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,7 +14,7 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.parameter import Parameter
 from ros_graph import Graph
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
+from sensor_msgs.msg import CompressedImage, Image, PointCloud2
 from std_msgs.msg import Header
 
 from limbloc_ros.core.camera import Rig
@@ -27,8 +25,8 @@ from limbloc_ros.nodes.carving import CarvingNode
 from limbloc_ros.rig.rig_file import save_rig
 from limbloc_ros.ros import topics
 from limbloc_ros.ros.cloud_messages import cloud_to_hull
-from limbloc_ros.ros.image_messages import camera_to_info, mask_to_compressed, mask_to_image
-from limbloc_ros.ros.messages import make_header, stamp_ns, transform_to_message
+from limbloc_ros.ros.image_messages import mask_to_compressed, mask_to_image
+from limbloc_ros.ros.messages import make_header, stamp_ns
 from limbloc_ros.simulation.room import SimulatedRoom, default_rig
 
 CAMERAS = 4
@@ -295,76 +293,6 @@ def test_what_cannot_work_stops_the_node_at_its_start(
 ) -> None:
     with pytest.raises(error, match=words):
         graph.add(CarvingNode, **{"rig_file": rig_file, **parameters})
-
-
-# --- CameraInfo and TF ---
-
-
-def fake_tf2(transforms: dict[tuple[str, str], Any]) -> Any:
-    """The few names of tf2_ros that we use; it has no wheel, so a stand-in is all that runs everywhere."""
-    module = types.ModuleType("tf2_ros")
-
-    class TransformException(Exception):
-        pass
-
-    class Buffer:
-        def lookup_transform(self, parent: str, child: str, _: object) -> Any:
-            if (parent, child) not in transforms:
-                raise TransformException(f"{parent} {child}")
-            return transforms[parent, child]
-
-    module.TransformException = TransformException
-    module.Buffer = Buffer
-    module.TransformListener = lambda buffer, node: (buffer, node)
-    return module
-
-
-@pytest.fixture
-def tf(monkeypatch: pytest.MonkeyPatch) -> dict[tuple[str, str], Any]:
-    transforms: dict[tuple[str, str], Any] = {}
-    monkeypatch.setitem(sys.modules, "tf2_ros", fake_tf2(transforms))
-    return transforms
-
-
-def test_a_rig_from_camera_info_and_tf(graph: Graph, rig: Rig, person: Masks, tf: dict[tuple[str, str], Any]) -> None:
-    node = graph.add(CarvingNode, cameras=list(rig.names), volume_min=[-1.5, -1.5, 0.0], volume_max=[1.5, 1.5, 2.4])
-    diagnostics = graph.diagnostics()
-    graph.until(diagnostics.says("carving: hull", "no rig yet", "no CameraInfo on cam3/camera_info"))
-    for camera in rig.cameras:
-        frame = topics.optical_frame(camera.name)
-        info = graph.publisher(CameraInfo, topics.camera_info(camera.name))
-        info.publish(camera_to_info(camera, make_header(T0_NS, frame)))
-    graph.until(diagnostics.says("carving: hull", "TF has no transform from room to 'cam0_optical'"))
-    for camera in rig.cameras:
-        frame = topics.optical_frame(camera.name)
-        tf["room", frame] = transform_to_message(camera.T_world_camera, frame, make_header(0, "room"))
-    graph.until(lambda: node.rig is not None)
-    cameras = Cameras(graph, rig.names)
-    hull = cameras.hull(person, 0)
-    expected = Carver(rig).carve(person)
-    assert hull is not None
-    assert isinstance(expected, Hull)
-    # A quaternion does not carry a rotation to the last bit.
-    assert hull.inside_count == pytest.approx(expected.inside_count, rel=1e-3)
-
-
-def test_an_all_zero_k_is_explained(graph: Graph, rig: Rig, tf: dict[tuple[str, str], Any]) -> None:
-    graph.add(CarvingNode, cameras=["cam0", "cam1"])
-    diagnostics = graph.diagnostics()
-    for camera in rig.cameras[:2]:
-        frame = topics.optical_frame(camera.name)
-        tf["room", frame] = transform_to_message(camera.T_world_camera, frame, make_header(0, "room"))
-        msg = camera_to_info(camera, make_header(T0_NS, frame))
-        if camera.name == "cam1":
-            msg.k = np.zeros(9)
-        graph.publisher(CameraInfo, topics.camera_info(camera.name)).publish(msg)
-    graph.until(diagnostics.says("carving: camera cam1", "all-zero K", "camera_calibration"))
-
-
-def test_without_tf2_the_error_says_what_to_do(graph: Graph, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "tf2_ros", None)
-    with pytest.raises(RigError, match="tf2-ros-py, or give the parameter rig_file"):
-        graph.add(CarvingNode, cameras=["cam0", "cam1"])
 
 
 def test_neither_rig_file_nor_cameras(graph: Graph) -> None:

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import dataclasses
-import sys
 import types
 import xml.etree.ElementTree as ET
 from array import array
@@ -35,7 +34,7 @@ from limbloc_ros.nodes.pose import PoseNode
 from limbloc_ros.nodes.segmentation import SegmentationNode
 from limbloc_ros.nodes.simulated_cameras import SimulatedCamerasNode
 from limbloc_ros.rig.rig_file import save_rig
-from limbloc_ros.ros import topics
+from limbloc_ros.ros import body_output, topics
 from limbloc_ros.ros.body_output import body_id, body_pose
 from limbloc_ros.ros.cloud_messages import empty_hull_cloud, hull_to_cloud
 from limbloc_ros.ros.image_messages import message_to_mask
@@ -297,9 +296,8 @@ def test_tf_and_the_list_of_bodies_where_they_exist(
     graph: Graph, hull: Hull, offline: Pose, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sent: list[Any] = []
-    tf2: Any = types.ModuleType("tf2_ros")
-    tf2.TransformBroadcaster = lambda node: types.SimpleNamespace(sendTransform=sent.extend)
-    monkeypatch.setitem(sys.modules, "tf2_ros", tf2)
+    output = types.SimpleNamespace(available=True, send=sent.extend)
+    monkeypatch.setattr(body_output, "TransformOutput", lambda node: output)
     node = graph.add(PoseNode)
     tracked: list[IdsList] = []
     node.bodies._ids_list, node.bodies._tracked = IdsList, types.SimpleNamespace(publish=tracked.append)

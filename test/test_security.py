@@ -35,7 +35,7 @@ FOLDERS = ("limbloc_ros", "launch", "tools", "examples", "fuzz")
 SELDOM = {
     "/lab/humans/bodies/tracked" if import_ids_list() is None else "",
     "/lab/true_joints_*",
-    *({"/tf", "/tf_static"} if transforms.import_tf2() is None else ()),
+    *({"/tf", "/tf_static"} if transforms.import_tf_message() is None else ()),
 }
 
 

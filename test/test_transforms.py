@@ -1,19 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Transforms of a small robot description against positions worked by hand, and TF that is not there."""
+"""Transforms of a small robot description and chains of them against positions worked by hand."""
 
 from __future__ import annotations
 
 import math
-import sys
-import types
 from typing import Any
 
 import numpy as np
 import pytest
-from ros_graph import Graph
 
+from limbloc_ros.core.errors import RigError
+from limbloc_ros.ros import transforms
 from limbloc_ros.ros.messages import make_header, message_to_transform, stamp_ns
-from limbloc_ros.ros.transforms import TransformOutput, link_transforms
+from limbloc_ros.ros.transforms import TransformOutput, TransformTree, link_transforms
 
 ARM = """
 <robot name="arm">
@@ -63,20 +62,61 @@ def test_a_missing_angle_is_an_error_not_a_zero() -> None:
         chain({"shoulder": 0.0})
 
 
-def test_tf_is_sent_when_it_is_there_and_left_out_when_not(monkeypatch: pytest.MonkeyPatch) -> None:
-    sent: list[Any] = []
-    module: Any = types.ModuleType("tf2_ros")
-    module.TransformBroadcaster = lambda node: types.SimpleNamespace(sendTransform=sent.extend)
-    graph = Graph()
-    links = link_transforms(ARM, {"shoulder": 0.0, "elbow": 0.0}, make_header(7, "room"))
-    monkeypatch.setitem(sys.modules, "tf2_ros", module)
-    output = TransformOutput(graph.tester)
-    output.send(links)
-    assert output.available
-    assert sent == links
-    monkeypatch.setitem(sys.modules, "tf2_ros", None)
-    output = TransformOutput(graph.tester)
-    output.send(links)
+def shift(x: float, y: float = 0.0, z: float = 0.0) -> np.ndarray:
+    T = np.eye(4)
+    T[:3, 3] = x, y, z
+    return T
+
+
+#: x to y, y to z, z to x.
+ROUND = np.array([[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1.0]])
+
+
+@pytest.fixture
+def tree() -> TransformTree:
+    """room -> ceiling -> cam0 and cam1, and room -> table; elsewhere base -> arm."""
+    tree = TransformTree()
+    tree.set("ceiling", "cam0", shift(1.0) @ ROUND)  # children may come before their parents
+    tree.set("ceiling", "cam1", shift(-1.0))
+    tree.set("room", "ceiling", shift(0.0, 0.0, 3.0))
+    tree.set("room", "table", shift(0.0, 2.0, 1.0))
+    tree.set("base", "arm", shift(0.5))
+    return tree
+
+
+def test_transforms_are_chained_up_and_down(tree: TransformTree) -> None:
+    np.testing.assert_allclose(tree.find("room", "cam1"), shift(-1.0, 0.0, 3.0))
+    np.testing.assert_allclose(tree.find("cam1", "room"), shift(1.0, 0.0, -3.0))
+    np.testing.assert_allclose(tree.find("table", "cam1"), shift(-1.0, -2.0, 2.0))
+    np.testing.assert_allclose(tree.find("cam1", "cam1"), np.eye(4))
+    # What is 1 m ahead (z) of cam0 is 1 m further along x in the room.
+    np.testing.assert_allclose(tree.find("room", "cam0") @ [0, 0, 1, 1], [2, 0, 3, 1])
+    # cam1 is 2 m behind cam0 in the ceiling's x, which is cam0's z.
+    np.testing.assert_allclose(tree.find("cam0", "cam1")[:3, 3], [0, 0, -2], atol=1e-12)
+
+
+def test_the_newest_place_counts(tree: TransformTree) -> None:
+    tree.set("ceiling", "cam1", shift(-4.0))
+    np.testing.assert_allclose(tree.find("room", "cam1"), shift(-4.0, 0.0, 3.0))
+    tree.set("table", "cam1", shift(0.0, 0.0, 0.1))
+    np.testing.assert_allclose(tree.find("room", "cam1"), shift(0.0, 2.0, 1.1))
+
+
+def test_what_is_not_known_is_explained(tree: TransformTree) -> None:
+    with pytest.raises(RigError, match="nobody publishes a frame 'cam7'; there is arm, base, cam0, cam1, ceiling"):
+        tree.find("room", "cam7")
+    with pytest.raises(RigError, match="cam0 hangs below 'room', arm below 'base', and nothing joins them"):
+        tree.find("cam0", "arm")
+    with pytest.raises(RigError, match="nobody publishes a frame 'room'; there is no TF at all"):
+        TransformTree().find("room", "cam0")
+    tree.set("cam0", "room", shift(1.0))  # a circle must not hang it
+    with pytest.raises(RigError, match="nothing joins them"):
+        tree.find("room", "arm")
+
+
+def test_without_the_message_nothing_is_sent(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(transforms, "import_tf_message", lambda: None)
+    node: Any = None  # is not even asked for a publisher
+    output = TransformOutput(node)
+    output.send(link_transforms(ARM, {"shoulder": 0.0, "elbow": 0.0}, make_header(7, "room")))
     assert not output.available
-    assert len(sent) == 3
-    graph.close()

@@ -61,7 +61,7 @@ class BodiesOutput:
         """For the diagnostics."""
         if self._transforms is None:
             return "off"
-        return self._publish_tf if self._transforms.available else "off: tf2_ros is not installed"
+        return self._publish_tf if self._transforms.available else "off: tf2_msgs is not installed"
 
     def id_of(self, number: int) -> str:
         """What person `number` is called."""

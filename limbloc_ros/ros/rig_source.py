@@ -17,7 +17,7 @@ from limbloc_ros.rig.rig_file import load_rig
 from limbloc_ros.rig.volume import derive_volume
 from limbloc_ros.ros import topics
 from limbloc_ros.ros.image_messages import info_to_camera
-from limbloc_ros.ros.transforms import TransformLookup
+from limbloc_ros.ros.transforms import TransformListener
 
 RETRY_S = 0.5
 #: Cameras that are not there after this long are left out until they come.
@@ -46,7 +46,7 @@ class RigFromTopics:
         on_rig: gets every new rig.
 
     Raises:
-        RigError: tf2_ros is not installed.
+        RigError: tf2_msgs is not installed.
         ConfigError: no cameras, or a volume that is not two corners.
     """
 
@@ -67,7 +67,7 @@ class RigFromTopics:
             raise ConfigError(
                 f"parameters volume_min and volume_max: expected three numbers in metres each, got {volume}"
             )
-        self._tf = TransformLookup(node)
+        self._tf = TransformListener(node)
         self._names = tuple(names)
         self._world_frame = world_frame
         self._volume = volume
@@ -118,11 +118,10 @@ class RigFromTopics:
         info = self._infos.get(name)
         if info is None:
             raise RigError(f"camera {name}: no CameraInfo on {topics.camera_info(name)} yet")
-        T = self._tf.find(self._world_frame, info.header.frame_id)
-        if T is None:
-            raise RigError(
-                f"camera {name}: TF has no transform from {self._world_frame} to {info.header.frame_id!r} yet"
-            )
+        try:
+            T = self._tf.find(self._world_frame, info.header.frame_id)
+        except RigError as error:
+            raise RigError(f"camera {name}: {error}") from None
         return info_to_camera(info, name, T)
 
 

@@ -67,6 +67,8 @@ TRUE_JOINTS = "true_joints"  # the same of the first simulated person
 MARKERS = "markers"  # visualization_msgs/MarkerArray, stick figure and flesh figure
 JOINT_ANGLES = "joint_angles"  # sensor_msgs/JointState, the full native set
 DIAGNOSTICS = "/diagnostics"  # diagnostic_msgs/DiagnosticArray
+TF = "/tf"  # tf2_msgs/TFMessage
+TF_STATIC = "/tf_static"  # the same, for what never moves
 
 
 def true_joints(person: int) -> str:
@@ -145,6 +147,14 @@ STREAM_QOS = _reliable(5)
 #: Masks and hulls on their way into nodes that carve and fit: deep enough for all that comes meanwhile.
 WORK_QOS = _reliable(30)
 DIAGNOSTICS_QOS = _reliable(10)
+#: As tf2_ros has them: what moves, what each publisher keeps of all that does not, and many such publishers heard.
+TF_QOS = _reliable(100)
+TF_STATIC_SUBSCRIPTION_QOS = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST,
+    depth=100,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
 #: Kept for late joiners (the URDF).
 LATCHED_QOS = QoSProfile(
     history=HistoryPolicy.KEEP_LAST,

@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""TF where it is there: looking up, broadcasting, and the transforms that a URDF makes of joint angles.
+"""TF where it is there: listening, broadcasting, and the transforms that a URDF makes of joint angles.
 
-tf2_ros comes with an apt ROS 2 but has no wheel, so it is imported only when somebody wants TF.
+All that is needed is the message, tf2_msgs. It comes with an apt ROS 2; it has no wheel, but tools/build_tf2_msgs.py
+builds it with the generators that the other wheels brought. tf2_ros and its C++ buffer are not needed: cameras stand
+still, so the newest transforms are the right ones and only have to be chained.
 """
 
 from __future__ import annotations
@@ -15,63 +17,138 @@ import numpy as np
 from geometry_msgs.msg import TransformStamped
 from numpy.typing import NDArray
 from rclpy.node import Node
-from rclpy.time import Time
 from std_msgs.msg import Header
 
-from limbloc_ros.core.errors import RigError
+from limbloc_ros.core.errors import InputError, RigError
+from limbloc_ros.ros import topics
 from limbloc_ros.ros.messages import message_to_transform, transform_to_message
 
 Array = NDArray[np.float64]
 
 
-def import_tf2() -> Any | None:
-    """The module tf2_ros, or None where there is none."""
+def import_tf_message() -> Any | None:
+    """The class tf2_msgs.msg.TFMessage, or None where there is none."""
     try:
-        import tf2_ros
+        from tf2_msgs.msg import TFMessage
     except ImportError:
         return None
-    return tf2_ros
+    return TFMessage
 
 
-class TransformLookup:
-    """Poses of camera frames from TF.
+class TransformTree:
+    """Frames, each with its newest pose in its parent."""
+
+    def __init__(self) -> None:
+        self._parents: dict[str, tuple[str, Array]] = {}
+
+    def set(self, parent: str, child: str, T_parent_child: Array) -> None:
+        """Put a frame where it is, in place of where it was."""
+        self._parents[child] = parent, T_parent_child
+
+    def find(self, parent: str, child: str) -> Array:
+        """T_parent_child [4, 4], up to the frame that both descend from and down again.
+
+        Raises:
+            RigError: nobody told of one of the frames, or how they hang together.
+        """
+        above_child, above_parent = self._ancestors(child), self._ancestors(parent)
+        for frame, T_frame_child in above_child.items():
+            if frame in above_parent:
+                return np.asarray(np.linalg.solve(above_parent[frame], T_frame_child))
+        known = self._parents.keys() | {frame for frame, _ in self._parents.values()}
+        start = f"TF has no transform from {parent} to {child!r} yet"
+        for frame in (parent, child):
+            if frame not in known:
+                raise RigError(f"{start}: nobody publishes a frame {frame!r}; there is {_listed(known)}")
+        roots = [list(above)[-1] for above in (above_parent, above_child)]
+        raise RigError(
+            f"{start}: {parent} hangs below {roots[0]!r}, {child} below {roots[1]!r}, and nothing joins them"
+        )
+
+    def _ancestors(self, frame: str) -> dict[str, Array]:
+        """T_ancestor_frame [4, 4] of the frame itself, its parent, and so on; a circle ends where it closes."""
+        found, T = {frame: np.eye(4)}, np.eye(4)
+        while frame in self._parents:
+            frame, T_parent_frame = self._parents[frame]
+            if frame in found:
+                break
+            T = T_parent_frame @ T
+            found[frame] = T
+        return found
+
+
+class TransformListener:
+    """Hears all transforms of the graph.
+
+    Attributes:
+        tree: what is known.
+        problems: why transforms were left out, by child frame.
 
     Raises:
-        RigError: tf2_ros is not installed.
+        RigError: tf2_msgs is not installed.
     """
 
     def __init__(self, node: Node) -> None:
-        tf2 = import_tf2()
-        if tf2 is None:
+        message = import_tf_message()
+        if message is None:
             raise RigError(
-                "the cameras' poses should come from TF, but Python cannot import tf2_ros: "
-                "install ros-<distro>-tf2-ros-py, or give the parameter rig_file"
+                "the cameras' poses should come from TF, but Python cannot import tf2_msgs: install "
+                "ros-<distro>-tf2-msgs, or without an apt ROS run tools/build_tf2_msgs.py, or give the parameter "
+                "rig_file"
             )
-        self._unknown: type[Exception] = tf2.TransformException
-        self._buffer = tf2.Buffer()
-        self._listener = tf2.TransformListener(self._buffer, node)
+        self.tree = TransformTree()
+        self.problems: dict[str, str] = {}
+        node.create_subscription(message, topics.TF, self._on_message, topics.TF_QOS)
+        node.create_subscription(message, topics.TF_STATIC, self._on_message, topics.TF_STATIC_SUBSCRIPTION_QOS)
 
-    def find(self, parent: str, child: str) -> Array | None:
-        """The newest T_parent_child [4, 4], or None while TF does not know it."""
+    def _on_message(self, msg: Any) -> None:
+        for transform in msg.transforms:
+            try:
+                T = message_to_transform(transform)
+            except InputError as error:
+                self.problems[transform.child_frame_id] = str(error)
+                continue
+            self.problems.pop(transform.child_frame_id, None)
+            self.tree.set(transform.header.frame_id, transform.child_frame_id, T)
+
+    def find(self, parent: str, child: str) -> Array:
+        """T_parent_child [4, 4]; raises RigError as long as it is not known."""
         try:
-            return message_to_transform(self._buffer.lookup_transform(parent, child, Time()))
-        except self._unknown:
-            return None
+            return self.tree.find(parent, child)
+        except RigError as error:
+            if child in self.problems:
+                raise RigError(f"{error}; {self.problems[child]}") from None
+            raise
 
 
 class TransformOutput:
-    """Sends transforms when tf2_ros is installed, does nothing otherwise (`available` tells)."""
+    """Sends transforms when tf2_msgs is installed, does nothing otherwise (`available` tells).
+
+    Args:
+        node: where the publisher lives.
+        static: they never move: they are kept for those who come later.
+    """
 
     def __init__(self, node: Node, static: bool = False) -> None:
-        tf2 = import_tf2()
-        self.available = tf2 is not None
-        if tf2 is not None:
-            self._broadcaster = tf2.StaticTransformBroadcaster(node) if static else tf2.TransformBroadcaster(node)
+        self._message = import_tf_message()
+        self._static: dict[str, TransformStamped] | None = {} if static else None
+        if self._message is not None:
+            topic, qos = (topics.TF_STATIC, topics.LATCHED_QOS) if static else (topics.TF, topics.TF_QOS)
+            self._publisher = node.create_publisher(self._message, topic, qos)
+
+    @property
+    def available(self) -> bool:
+        """Whether there is TF."""
+        return self._message is not None
 
     def send(self, transforms: Sequence[TransformStamped]) -> None:
-        """Broadcast some transforms."""
-        if self.available:
-            self._broadcaster.sendTransform(list(transforms))
+        """Broadcast some transforms; static ones together with all sent before, since only the last message is kept."""
+        if self._message is None:
+            return
+        if self._static is not None:
+            self._static |= {transform.child_frame_id: transform for transform in transforms}
+            transforms = list(self._static.values())
+        self._publisher.publish(self._message(transforms=list(transforms)))
 
 
 def link_transforms(urdf: str, angles: Mapping[str, float], header: Header) -> list[TransformStamped]:
@@ -110,3 +187,7 @@ def _turn(vector: Array) -> Array:
 
 def _numbers(text: str) -> Array:
     return np.array([float(word) for word in text.split()])
+
+
+def _listed(names: set[str]) -> str:
+    return ", ".join(sorted(names)) or "no TF at all"
