@@ -146,7 +146,7 @@ def find_heads(
     support = np.concatenate(
         [
             kernels.sphere_support(
-                grid.hull.sdf, grid.local(points - r * normals), r / voxel, _directions(96), 1.1 * voxel
+                grid.hull.sdf, grid.local(points - r * normals), r / voxel, even_directions(96), 1.1 * voxel
             )
             for r in HEAD_RADII_M
         ]
@@ -313,7 +313,7 @@ def part_of(flesh: Flesh, names: tuple[str, ...]) -> Flesh:
 
 
 @cache
-def _directions(count: int) -> Array:
+def even_directions(count: int) -> Array:
     """[count, 3] unit vectors spread evenly (a Fibonacci lattice)."""
     n = np.arange(count) + 0.5
     z = 1 - 2 * n / count
@@ -324,7 +324,7 @@ def _directions(count: int) -> Array:
 
 def _orientations(axis: Array, headings: int, cone_rad: float = 1.22) -> Array:
     """[R, 3, 3] rotations whose z axis lies within a cone around `axis`, each with evenly spread headings."""
-    directions = _directions(400)
+    directions = even_directions(400)
     z = directions[directions @ axis > np.cos(cone_rad)]
     other = np.where(np.abs(z[:, :1]) < 0.8, np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]))
     u = np.cross(z, other)

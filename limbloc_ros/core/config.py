@@ -169,14 +169,6 @@ class FitConfig:
     )
 
 
-@dataclass(frozen=True)
-class PipelineConfig:
-    """Everything between masks and joint angles."""
-
-    hull: HullConfig = dataclasses.field(default_factory=HullConfig)
-    fit: FitConfig = dataclasses.field(default_factory=FitConfig)
-
-
 def validated(config: T) -> T:
     """Return `config` unchanged, or raise ConfigError naming the first field that is out of its bounds."""
     for field in dataclasses.fields(config):  # type: ignore[arg-type]

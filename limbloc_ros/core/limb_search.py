@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 
 from limbloc_ros.core import _anchors_kernels as kernels
 from limbloc_ros.core._figure_kernels import exp_so3
-from limbloc_ros.core.anchors import Grid, Limb
+from limbloc_ros.core.anchors import Grid, Limb, even_directions
 from limbloc_ros.core.figure import BONE, N_SPHERES, PARENTS, SPHERE, FigureState, Placed, place, proportions
 from limbloc_ros.core.geodesic import Maxima
 from limbloc_ros.core.pose import JOINT
@@ -290,14 +290,6 @@ def _frustum_samples() -> Array:
     return np.array(rows)
 
 
-def _fan(count: int = 200) -> Array:
-    n = np.arange(count) + 0.5
-    z = 1 - 2 * n / count
-    angle = np.pi * (1 + 5**0.5) * n
-    r = np.sqrt(1 - z * z)
-    return np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=1)
-
-
 _NOTHING = np.zeros(4)
 FRUSTUM = _frustum_samples()
-_FAN = _fan()
+_FAN = even_directions(200)

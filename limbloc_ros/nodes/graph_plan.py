@@ -6,7 +6,6 @@ The supervisor and the launch file both start what `plan_graph` says; it starts 
 
 from __future__ import annotations
 
-import dataclasses
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -288,11 +287,3 @@ def _namespace(streams: Mapping[str, CameraStream]) -> str:
     if len(found) > 1:
         raise ConfigError(f"expected all cameras of the recording in one namespace, got {', '.join(sorted(found))}")
     return found.pop()
-
-
-def with_overrides(config: SmartSpaceConfig, **changes: Any) -> SmartSpaceConfig:
-    """A copy with some values changed, checked again."""
-    values = {f.name: getattr(config, f.name) for f in dataclasses.fields(config)}
-    for key in ("processes", "network"):
-        values[key] = dataclasses.asdict(values[key])
-    return config_from_mapping(values | changes)

@@ -106,11 +106,6 @@ class BagReader:
         """Messages in the (readable part of the) bag."""
         return sum(topic.count for topic in self.topics.values())
 
-    @property
-    def duration_s(self) -> float:
-        """From the first to the last message, s."""
-        return (self.end_ns - self.start_ns) / 1e9
-
     def messages(
         self, topics: Collection[str] | None = None, start_ns: int = 0, stop_ns: int = _FOREVER
     ) -> Iterator[BagMessage]:

@@ -252,9 +252,7 @@ def _small_multiples(
         order = [t for t in ("left", "right", "middle", "jump", "beyond the usual range") if t in shown]
         if order:
             handles = [shown[text] for text in order]
-            engine: Any = figure.get_layout_engine()
-            engine.set(rect=(0, 0, 1, 1 - LEGEND_IN / height))
-            figure.legend(handles, order, loc="upper center", ncols=len(order), fontsize=12)
+            legend_above(figure, handles, labels=order, ncols=len(order), fontsize=12)
     return figure
 
 
