@@ -109,7 +109,7 @@ def find_limbs(grid: Grid, state: FigureState, kind: str, side: str, cues: Cues)
             continue
         end_score = end_score - LIMIT * _hinge_limits(directions[m], forward, _unit(ends - middles[m]), kind)
         for e in _spread(ends, end_score, KEPT_ENDS, 0.05):
-            tip, tip_gain = _find_tip(grid, middles[m], ends[e], forward, directions[m], bones, kind)
+            tip, tip_gain = _find_tip(grid, middles[m], ends[e], forward, bones, kind)
             total = 0.45 * middle_score[m] + 0.45 * end_score[e] + 0.10 * tip_gain
             limbs.append(Limb(np.stack([middles[m], ends[e], tip]), float(total)))
     limbs.sort(key=lambda limb: -limb.gain)
@@ -208,23 +208,20 @@ def _on_sphere(grid: Grid, start: Array, bones: _Bones, bone: int, cues: Cues, b
     return grid.world(ends), score - 0.3 * shallow
 
 
-def _find_tip(
-    grid: Grid, middle: Array, end: Array, forward: Array, direction: Array, bones: _Bones, kind: str
-) -> tuple[Array, float]:
+def _find_tip(grid: Grid, middle: Array, end: Array, forward: Array, bones: _Bones, kind: str) -> tuple[Array, float]:
     """Toe or fingertip: the direction from ankle or wrist that explains most, and what it gains per volume."""
     voxel = grid.hull.voxel_m
     length, near, far = bones.lengths[2] / voxel, bones.radii[2] / voxel, bones.radii[3] / voxel
     a = grid.local(end)
     along = _unit(end - middle)
-    fan = _FAN
-    ends = a + length * fan
+    ends = a + length * _FAN
     before = np.array([*grid.local(middle), bones.radii[1] / voxel])
     score = kernels.frustum_gain(grid.earns, a, near, ends, far, FRUSTUM, before, PRICE)
     score = score / (np.pi * length * (near * near + near * far + far * far) / 3)
-    bend = fan @ along  # 1 goes straight on
+    bend = _FAN @ along  # 1 goes straight on
     if kind == "leg":
         relaxed = _unit(forward - (forward @ along) * along)
-        score = score - LIMIT * np.maximum(0.0, np.abs(bend - 0.25) - 0.45) - 0.4 * (1.0 - fan @ relaxed)
+        score = score - LIMIT * np.maximum(0.0, np.abs(bend - 0.25) - 0.45) - 0.4 * (1.0 - _FAN @ relaxed)
     else:
         score = score - LIMIT * np.maximum(0.0, 0.4 - bend) + 0.1 * bend
     best = int(np.argmax(score))

@@ -116,7 +116,7 @@ def flesh_over_hull(run: RunData, samples: Sequence[Sample]) -> Figure:
     return sheet(panels(samples, layers), [caption(run, s) for s in samples], columns=3)
 
 
-def geodesic_sheet(run: RunData, samples: Sequence[Sample]) -> Figure:
+def geodesic_sheet(samples: Sequence[Sample]) -> Figure:
     """Fig. 1 (right): the hull coloured by geodesic distance from the centre of mass, front and back."""
     fields = [np.where(np.isfinite(s.geodesic), s.geodesic, np.nan) for s in samples]
     top = float(np.ceil(max(np.nanmax(f) for f in fields) * 10) / 10)
@@ -126,11 +126,11 @@ def geodesic_sheet(run: RunData, samples: Sequence[Sample]) -> Figure:
         return np.asarray(GEODESIC_MAP(distance / top)[:, :3] * np.where(near_line, 0.55, 1.0)[:, None])
 
     return _field_sheet(
-        run, samples, fields, colours, GEODESIC_MAP, 0.0, top, "geodesic distance from the centre of mass (m)"
+        samples, fields, colours, GEODESIC_MAP, 0.0, top, "geodesic distance from the centre of mass (m)"
     )
 
 
-def curvature_sheet(run: RunData, samples: Sequence[Sample]) -> Figure:
+def curvature_sheet(samples: Sequence[Sample]) -> Figure:
     """Fig. 4: the hull coloured by curvature, front and back; flat is pale, sharply curved is blue."""
     fields = [np.degrees(s.surface.curvature) for s in samples]
     top = float(np.ceil(np.nanpercentile(np.concatenate(fields), 97) / 5) * 5)
@@ -139,11 +139,10 @@ def curvature_sheet(run: RunData, samples: Sequence[Sample]) -> Figure:
         return np.asarray(CURVATURE_MAP(curvature / top)[:, :3])
 
     text = "curvature: mean angle between a normal and its neighbours' (degrees)"
-    return _field_sheet(run, samples, fields, colours, CURVATURE_MAP, 0.0, top, text)
+    return _field_sheet(samples, fields, colours, CURVATURE_MAP, 0.0, top, text)
 
 
 def _field_sheet(
-    run: RunData,
     samples: Sequence[Sample],
     fields: Sequence[Array],
     colours: Callable[[Array], Array],
@@ -163,7 +162,7 @@ def _field_sheet(
     return sheet(pictures, titles, columns=len(samples), colour_bar=(colour_map, low, high, text))
 
 
-def normals_sheet(run: RunData, samples: Sequence[Sample]) -> Figure:
+def normals_sheet(samples: Sequence[Sample]) -> Figure:
     """Fig. 3: the surface normals as needles, on every sixth surface voxel."""
 
     def layers(sample: Sample, hull: Mesh) -> list[Layer]:
@@ -173,7 +172,7 @@ def normals_sheet(run: RunData, samples: Sequence[Sample]) -> Figure:
     return sheet(panels(samples, layers), [f"frame {s.frame_index}" for s in samples], columns=len(samples))
 
 
-def anchors_sheet(run: RunData, samples: Sequence[Sample]) -> Figure:
+def anchors_sheet(samples: Sequence[Sample]) -> Figure:
     """Figs. 6 and 7: the points that the paper's engine found on the hull, left blue and right orange."""
 
     def layers(sample: Sample, hull: Mesh) -> list[Layer]:

@@ -59,21 +59,21 @@ def sample_pictures(run: RunData, samples: Sequence[Sample]) -> list[ReportPictu
             "The hull coloured by the distance along its surface from the point nearest the centre of mass, as in the "
             "paper's fig. 1 (right), with a line every 10 cm. Hands, feet and head are its far ends; where an arm "
             "touches the trunk the short cut shows (the paper's closed loop problem).",
-            lambda: figure_png(pictures.geodesic_sheet(run, few)),
+            lambda: figure_png(pictures.geodesic_sheet(few)),
         ),
         ReportPicture(
             "curvature",
             "Curvature",
             "The hull coloured by curvature, the mean angle between a surface voxel's normal and its neighbours', as "
             "in the paper's fig. 4: flat is pale, sharply curved is blue.",
-            lambda: figure_png(pictures.curvature_sheet(run, few)),
+            lambda: figure_png(pictures.curvature_sheet(few)),
         ),
         ReportPicture(
             "normals",
             "Surface normals",
             "Normals of every sixth surface voxel by the 3D Sobel filter (eq. 1), as in the paper's fig. 3. Colour is "
             "direction: red, green and blue are the shares along x, y and z.",
-            lambda: figure_png(pictures.normals_sheet(run, few)),
+            lambda: figure_png(pictures.normals_sheet(few)),
         ),
     ]
     anchored = [sample for sample in samples if sample.anchors]
@@ -84,7 +84,7 @@ def sample_pictures(run: RunData, samples: Sequence[Sample]) -> list[ReportPictu
                 "Anchor points",
                 "What the paper's engine went by, as in its figs. 6 and 7: the points found on the hull by curvature "
                 "and geodesic distance. The person's own left is blue, the right orange.",
-                lambda: figure_png(pictures.anchors_sheet(run, _spread(anchored, FIELD_SAMPLES))),
+                lambda: figure_png(pictures.anchors_sheet(_spread(anchored, FIELD_SAMPLES))),
             )
         )
     with_images = [sample for sample in samples if sample.images and sample.rig is not None]

@@ -257,7 +257,7 @@ def _agreement(
         if _strangers(report, scores, guilty[0]):
             excused.add(guilty[0])
             continue
-        trials = [_explain(grid, recording, chosen, frames, camera, fps) for camera in guilty]
+        trials = [_explain(grid, recording, frames, camera, fps) for camera in guilty]
         best = min(trials, key=lambda trial: trial.left)
         _tell(report, grid, scores, best, [grid.names[c] for c in guilty if c != best.camera], fps)
         excused.add(best.camera)
@@ -321,7 +321,6 @@ class _Trial:
 def _explain(
     grid: Grid,
     recording: Sequence[Frame],
-    chosen: Sequence[int],
     frames: Sequence[Frame],
     camera: int,
     fps: float | None,
