@@ -11,6 +11,7 @@ import numpy as np
 from matplotlib import colormaps
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from numpy.typing import NDArray
 
@@ -21,6 +22,12 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.uint8]
 
 DPI = 110
+#: Lets a name be read on top of lines and colours.
+_HALO = [withStroke(linewidth=2.5, foreground="white")]
+#: Names stand so far outside of the cameras, m.
+_LABEL_M = 0.12
+#: Room for them around the cameras, m.
+_MARGIN_M = 0.65
 #: Colours that also colour-blind people tell apart, one after the other for the cameras.
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#7f7f7f", "#5d3a9b")
 
@@ -30,11 +37,11 @@ def colour(index: int) -> str:
     return COLOURS[index % len(COLOURS)]
 
 
-def png(figure: Figure) -> bytes:
-    """A figure as PNG."""
+def png(figure: Figure, tight: bool = False) -> bytes:
+    """A figure as PNG; `tight` cuts its empty margins off, of which 3D axes have many."""
     FigureCanvasAgg(figure)
     out = io.BytesIO()
-    figure.savefig(out, format="png", dpi=DPI)
+    figure.savefig(out, format="png", dpi=DPI, bbox_inches="tight" if tight else None)
     return out.getvalue()
 
 
@@ -115,7 +122,7 @@ def pair_picture(table: Array, names: Sequence[str]) -> bytes:
 
 def coverage_map(coverage: Coverage, rig: Rig) -> bytes:
     """A floor plan: how many cameras see each place from ankles to raised hands, and the cameras."""
-    figure = Figure(figsize=(6.6, 5.6), layout="constrained")
+    figure = Figure(figsize=(7.0, 5.8), layout="constrained")
     axes = figure.add_subplot()
     most = len(rig.cameras)
     half = STEP_M / 2
@@ -123,8 +130,17 @@ def coverage_map(coverage: Coverage, rig: Rig) -> bytes:
     how: dict[str, Any] = {"origin": "lower", "extent": extent, "interpolation": "nearest"}
     steps = colormaps["viridis"].resampled(most + 1)
     image = axes.imshow(coverage.whole.T, cmap=steps, vmin=-0.5, vmax=most + 0.5, **how)
-    bad = np.where(coverage.needed > coverage.whole.T, 1.0, np.nan)
-    axes.imshow(bad, cmap="autumn", vmin=0.9, vmax=2, alpha=0.55, **how)
+    blind = (coverage.needed > coverage.whole.T).repeat(8, axis=0).repeat(8, axis=1)  # so that its edge is the cells'
+    fine = (np.arange(8) - 3.5) / 8 * STEP_M
+    filled = axes.contourf(
+        (coverage.x[:, None] + fine).ravel(),
+        (coverage.y[:, None] + fine).ravel(),
+        blind.astype(float),
+        levels=[0.5, 1.5],
+        colors="none",
+        hatches=["////"],
+    )
+    filled.set(edgecolor="#ff3b30", linewidth=0.0)
     figure.colorbar(image, ax=axes, label="cameras", ticks=range(0, most + 1, max(1, most // 8)), shrink=0.7)
     for i, camera in enumerate(rig.cameras):
         x, y = camera.T_world_camera[:2, 3]
@@ -132,16 +148,19 @@ def coverage_map(coverage: Coverage, rig: Rig) -> bytes:
         axes.annotate(
             "", (x + 0.5 * dx, y + 0.5 * dy), (x, y), arrowprops={"arrowstyle": "-|>", "color": colour(i), "lw": 1.6}
         )
-        axes.plot(x, y, "o", color=colour(i), ms=6)
-        axes.text(x, y, f" {camera.name}", fontsize=8, color="black", va="bottom")
+        axes.plot(x, y, "o", color=colour(i), mec="white", ms=7)
+        _name(axes, camera, rig.volume_min, rig.volume_max)
+    stands = np.array([camera.T_world_camera[:2, 3] for camera in rig.cameras])
+    low, high = np.minimum(stands.min(axis=0), rig.volume_min[:2]), np.maximum(stands.max(axis=0), rig.volume_max[:2])
     axes.set(
         xlabel="x m",
         ylabel="y m",
+        xlim=(low[0] - _MARGIN_M, high[0] + _MARGIN_M),
+        ylim=(low[1] - _MARGIN_M, high[1] + _MARGIN_M),
         aspect="equal",
-        title=f"seen from ankles to raised hands; red: by fewer than {coverage.needed} cameras",
+        title=f"seen from ankles to raised hands; hatched: by fewer than {coverage.needed} cameras",
     )
     axes.title.set_fontsize(9)
-    axes.margins(0.08)
     return png(figure)
 
 
@@ -157,6 +176,21 @@ def fatness_plot(counts: Sequence[int], factors: Sequence[Sequence[float]]) -> b
     axes.set(xlabel="cameras", ylabel="hull / body volume", ylim=(0.9, None), xticks=counts)
     axes.grid(alpha=0.3)
     return png(figure)
+
+
+def _name(axes: Any, camera: Camera, low: Array, high: Array, *, above_m: float | None = None) -> None:
+    """Write a camera's name beside it, further from the middle of the volume; in 3D axes `above_m` higher."""
+    place = camera.T_world_camera[:3, 3]
+    away = place[:2] - (low + high)[:2] / 2
+    away = away / max(float(np.linalg.norm(away)), 1e-9)
+    x, y = place[:2] + _LABEL_M * away
+    how: dict[str, Any] = {"fontsize": 8, "path_effects": _HALO, "zorder": 100}
+    how["ha"] = ("right", "center", "left")[round(away[0]) + 1]
+    how["va"] = ("top", "center", "bottom")[round(away[1]) + 1]
+    if above_m is None:
+        axes.text(x, y, camera.name, **how)
+    else:
+        axes.text(x, y, place[2] + above_m, camera.name, **how)
 
 
 def frustum(camera: Camera, depth_m: float) -> Array:
@@ -192,15 +226,17 @@ def rig_picture(
         figure.suptitle(title, fontsize=11)
     for column, (elevation, azimuth) in enumerate(((24, -62), (90, -90))):
         axes = figure.add_subplot(1, 2, column + 1, projection="3d")
+        depth_m = np.clip(6.0 / len(cameras), 0.5, 0.9) * (1.0 if column == 0 else 1.6)  # many must not hide each other
         for i, camera in enumerate(cameras):
-            _draw_camera(axes, camera, colour(i), 0.9 if column == 0 else 1.6, label=True)
+            _draw_camera(axes, camera, colour(i), float(depth_m))
+            _name(axes, camera, low, high, above_m=0.1 if column == 0 else 0.0)
         _draw_room(axes, low, high, person_m)
         if extra is not None:
             extra(axes)
         points = np.array([camera.T_world_camera[:3, 3] for camera in cameras])
         lowest = np.minimum(points.min(axis=0), low)
         highest = np.maximum(points.max(axis=0), high)
-        margin = 0.3
+        margin = _MARGIN_M
         axes.set(
             xlim=(lowest[0] - margin, highest[0] + margin),
             ylim=(lowest[1] - margin, highest[1] + margin),
@@ -215,10 +251,10 @@ def rig_picture(
         if column == 1:
             axes.set_proj_type("ortho")
             axes.set_zticks([])
-    return png(figure)
+    return png(figure, tight=True)
 
 
-def _draw_camera(axes: Any, camera: Camera, shade: str, depth_m: float, label: bool) -> None:
+def _draw_camera(axes: Any, camera: Camera, shade: str, depth_m: float) -> None:
     points = frustum(camera, depth_m)
     centre, corners = points[0], points[1:]
     edges = [(centre, corner) for corner in corners]
@@ -226,8 +262,6 @@ def _draw_camera(axes: Any, camera: Camera, shade: str, depth_m: float, label: b
     axes.add_collection3d(Line3DCollection(edges, colors=shade, linewidths=0.9))
     axes.add_collection3d(Poly3DCollection([corners], facecolors=shade, alpha=0.12))
     axes.scatter(*centre, color=shade, s=18)
-    if label:
-        axes.text(centre[0], centre[1], centre[2] + 0.12, camera.name, color=shade, fontsize=8)
 
 
 def _draw_room(axes: Any, low: Array, high: Array, person_m: float) -> None:
