@@ -22,6 +22,15 @@ def test_every_command_line_parses(path):
         parse(command)
 
 
+@pytest.mark.parametrize("path", PAGES, ids=name_of)
+def test_no_table_is_torn(path):
+    """A row below an empty line is text with bars in it, unless it heads a table of its own."""
+    lines = re.sub(r"```.*?```", "", path.read_text(encoding="utf-8"), flags=re.S).splitlines()
+    for above, here, below in zip(["", *lines], lines, [*lines[1:], ""], strict=False):
+        if here.startswith("|") and not above.startswith("|"):
+            assert re.fullmatch(r"\|[-:| ]+\|", below), here
+
+
 def test_the_documents_do_have_commands():
     found = [command.split()[0] for path in TEXTS for command in commands(path.read_text(encoding="utf-8"))]
     assert len(found) > 50
