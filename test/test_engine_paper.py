@@ -8,8 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from limbloc_ros.core import _engine_paper_kernels as kernels
-from limbloc_ros.core._figure_kernels import part_distance
 from limbloc_ros.core.config import HullConfig
 from limbloc_ros.core.energy import xor_energy
 from limbloc_ros.core.engine_paper import LIMBS, TORSO, WITH_ALL, WITH_LEGS, WITH_TORSO, Branch, fit_state
@@ -43,19 +41,6 @@ def standing():
     arms_out = block_of("arms", [{"upper_arm_L_x": 0.9, "upper_arm_R_x": -0.9}])
     state = state.moved(arms_out.steps[0])
     return state, hull_of(state)
-
-
-def test_packed_distance_equals_the_plain_one():
-    rng = np.random.default_rng(3)
-    points, radii = rng.normal(size=(30, 3)) * 0.2, rng.uniform(0.01, 0.25, 30)
-    parts = np.array([rng.permutation(30)[:3] for _ in range(60)])
-    parts[:20, 2] = parts[:20, 1]
-    parts[:5, 1:] = parts[:5, :1]
-    table, weights = kernels.pack_parts(parts, points, radii), np.zeros(3)
-    for p in range(len(parts)):
-        for q in rng.normal(size=(20, 3)) * 0.4:
-            expected = part_distance(*q, parts[p], points, radii, weights)
-            assert kernels.packed_distance(*q, table, p) == pytest.approx(expected, abs=1e-9)
 
 
 def test_distances_are_exact_up_to_the_limit(standing):

@@ -90,7 +90,7 @@ def symmetrised(value: np.ndarray, names: list[str]) -> np.ndarray:
 
 
 def part_weights(p: torch.Tensor, c: torch.Tensor, r: torch.Tensor) -> torch.Tensor:
-    """Barycentric weights [..., Q, P, 3] of the nearest sphere of each part; see `_figure_kernels.part_distance`."""
+    """Barycentric weights [..., Q, P, 3] of the nearest sphere of each part; see `_part_kernels.distance_to_part`."""
     a, b, d = c.unbind(-2)
     ra, rb, rd = r.unbind(-1)
     options = []

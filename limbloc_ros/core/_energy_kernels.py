@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from limbloc_ros.core._figure_kernels import log_so3, part_distance
-from limbloc_ros.core._surface_fit_kernels import SLACK, add_block, distance_to_part, lay_out, robust_weight
+from limbloc_ros.core._figure_kernels import log_so3
+from limbloc_ros.core._part_kernels import SLACK, distance_to_part, lay_out, lay_out_part
+from limbloc_ros.core._surface_fit_kernels import add_block, robust_weight
 
 #: How much more a negative amount of clothing costs than a positive one.
 TIGHT = 25.0
@@ -174,9 +175,10 @@ def penetration_term(
 
     A sphere may sink in by the fraction `allowed` of its radius: flesh gives way, and figures are coarse.
     """
-    w = np.empty(3)
+    w, no_ray = np.empty(3), np.zeros(3)
     n = A.shape[0]
     row = np.empty(n)
+    part = np.empty(13)
     cost = 0.0
     for m in range(len(pairs)):
         s = pairs[m, 0]
@@ -188,7 +190,9 @@ def penetration_term(
         dz = spheres[a, 2] - z
         if dx * dx + dy * dy + dz * dz > 0.36:
             continue
-        d = part_distance(x, y, z, parts[p], spheres, radii, w)
+        lay_out_part(parts[p], spheres, radii, part)
+        d, w[1], w[2] = distance_to_part(part, x, y, z, no_ray)
+        w[0] = 1.0 - w[1] - w[2]
         e = (1.0 - allowed) * radii[s] - d
         if e <= 0.0:
             continue

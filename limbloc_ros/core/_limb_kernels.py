@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+from limbloc_ros.core._part_kernels import distance_to_part, lay_out
 from limbloc_ros.core._search_kernels import depth_at, spread_out
-from limbloc_ros.core._surface_fit_kernels import distance_to_part, lay_out
 
 #: Ragged masks eat into limbs: a bone may be thinner than expected by this fraction of its radius at no cost.
 EATEN = 0.4

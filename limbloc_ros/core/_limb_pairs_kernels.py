@@ -10,8 +10,9 @@ import numpy as np
 from numba import njit
 
 from limbloc_ros.core._energy_kernels import blended_sphere, sample_sdf
-from limbloc_ros.core._figure_kernels import log_so3, part_bounds, part_distance
-from limbloc_ros.core._surface_fit_kernels import lay_out, nearest_part, offset_from, robust_weight
+from limbloc_ros.core._figure_kernels import log_so3
+from limbloc_ros.core._part_kernels import distance_to_part, lay_out
+from limbloc_ros.core._surface_fit_kernels import nearest_part, offset_from, robust_weight
 
 #: A candidate pays at most so much (m^2) for violated joint limits.
 MOST_FOR_LIMITS = 5e-5
@@ -125,7 +126,8 @@ def limb_fits(
     first = np.empty((3, 3))
     second = np.empty((3, 3))
     local = np.empty((3, 3))
-    all_bounds = part_bounds(all_parts, spheres, radii)  # those that the limb must not go into stay where they are
+    all_rows, all_bounds = lay_out(all_parts, spheres, radii)  # what the limb must not go into stays where it is
+    no_ray = np.zeros(3)
     middle = np.empty(3)
     end = np.empty(3)
     upper = np.empty(3)
@@ -179,13 +181,13 @@ def limb_fits(
         for n in range(len(pairs)):
             s = pairs[n, 0]
             a = pairs[n, 1]
-            x = all_bounds[a, 0] - spheres[s, 0]
-            y = all_bounds[a, 1] - spheres[s, 1]
-            z = all_bounds[a, 2] - spheres[s, 2]
-            reach = all_bounds[a, 3] + radii[s]
+            x = all_bounds[0, a] - spheres[s, 0]
+            y = all_bounds[1, a] - spheres[s, 1]
+            z = all_bounds[2, a] - spheres[s, 2]
+            reach = all_bounds[3, a] + radii[s]
             if x * x + y * y + z * z > reach * reach:
                 continue
-            d = part_distance(spheres[s, 0], spheres[s, 1], spheres[s, 2], all_parts[pairs[n, 1]], spheres, radii, w)
+            d, _, _ = distance_to_part(all_rows[a], spheres[s, 0], spheres[s, 1], spheres[s, 2], no_ray)
             e = (1.0 - penetration[0]) * radii[s] - d
             if e > 0.0:
                 c, _ = robust_weight(e, penetration[1])

@@ -9,10 +9,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from limbloc_ros.core._figure_kernels import part_bounds
-
-#: Distances that differ by less (m) are equal but for rounding.
-SLACK = 1e-6
+from limbloc_ros.core._part_kernels import SLACK, distance_to_part, lay_out
 
 
 @njit(cache=True, inline="always", error_model="numpy")  # type: ignore[misc, unused-ignore]
@@ -41,101 +38,6 @@ def add_block(block: Any, slope: Any, w: Any, away: Any, residual: float, weight
                 both = first * w[m] * away[i]
                 for j in range(4):
                     block[4 * k + i, 4 * m + j] += both * away[j]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
-def lay_out(parts: Any, spheres: Any, radii: Any) -> tuple[Any, Any]:
-    """What `nearest_part` reads of the parts, each number where it is needed next.
-
-    Returns:
-        [P, 13]: number of spheres; the first one's place a; the ways u, v from it to the second and third; its radius,
-        and by how much theirs are larger; [4, P]: spheres around the parts (x, y, z, radius).
-    """
-    rows = np.zeros((len(parts), 13))
-    for p in range(len(parts)):
-        a, b, c = parts[p]
-        rows[p, 0] = 1.0 if b == a else (2.0 if c == b else 3.0)
-        for i in range(3):
-            rows[p, 1 + i] = spheres[a, i]
-            rows[p, 4 + i] = spheres[b, i] - spheres[a, i]
-            rows[p, 7 + i] = spheres[c, i] - spheres[a, i]
-        rows[p, 10] = radii[a]
-        rows[p, 11] = radii[b] - radii[a]
-        rows[p, 12] = radii[c] - radii[a]
-    return rows, part_bounds(parts, spheres, radii).T.copy()
-
-
-@njit(cache=True, inline="always", error_model="numpy")  # type: ignore[misc, unused-ignore]
-def _on_edge(qq: float, qd: float, dd: float, r: float, dr: float) -> tuple[float, float]:
-    """Signed distance to the convex hull of two spheres, and the weight of the second one at the nearest sphere.
-
-    qq: squared distance of the point from the first centre; qd: its product with the way to the second; dd: that way
-    squared; r: the first radius; dr: how much larger the second is.
-    """
-    if dd <= dr * dr + 1e-12:  # one sphere swallows the other
-        t = 1.0 if dr > 0.0 else 0.0
-    else:
-        t = qd / dd + dr * math.sqrt(max(qq - qd * qd / dd, 0.0) / (dd * (dd - dr * dr)))
-        t = min(1.0, max(0.0, t))
-    return math.sqrt(max(qq - 2.0 * t * qd + t * t * dd, 0.0)) - (r + t * dr), t
-
-
-@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
-def distance_to_part(row: Any, x: float, y: float, z: float, ray: Any) -> tuple[float, float, float]:
-    """Signed distance of a point, or of a ray through it, to a part of `lay_out`; weights of its 2nd and 3rd sphere.
-
-    See `_figure_kernels.part_distance`; but all is said by products of the ways between the point and the spheres, and
-    looking along a ray only takes the share along it out of those.
-    """
-    qx, qy, qz = x - row[1], y - row[2], z - row[3]
-    along_q = qx * ray[0] + qy * ray[1] + qz * ray[2]
-    qq = qx * qx + qy * qy + qz * qz - along_q * along_q
-    if row[0] == 1.0:
-        return math.sqrt(max(qq, 0.0)) - row[10], 0.0, 0.0
-    along_u = row[4] * ray[0] + row[5] * ray[1] + row[6] * ray[2]
-    uu = row[4] * row[4] + row[5] * row[5] + row[6] * row[6] - along_u * along_u
-    qu = qx * row[4] + qy * row[5] + qz * row[6] - along_q * along_u
-    r, rb, rc = row[10], row[11], row[12]
-    if row[0] == 2.0:
-        d, t = _on_edge(qq, qu, uu, r, rb)
-        return d, t, 0.0
-    along_v = row[7] * ray[0] + row[8] * ray[1] + row[9] * ray[2]
-    vv = row[7] * row[7] + row[8] * row[8] + row[9] * row[9] - along_v * along_v
-    uv = row[4] * row[7] + row[5] * row[8] + row[6] * row[9] - along_u * along_v
-    qv = qx * row[7] + qy * row[8] + qz * row[9] - along_q * along_v
-    s = t = -1.0
-    det = uu * vv - uv * uv
-    known = False
-    if det > 1e-10:
-        gs = (vv * rb - uv * rc) / det
-        gt = (uu * rc - uv * rb) / det
-        g2 = gs * rb + gt * rc
-        if g2 < 0.999:
-            known = True
-            s = (vv * qu - uv * qv) / det
-            t = (uu * qv - uv * qu) / det
-            h2 = qq - s * qu - t * qv  # above the plane, squared; along a ray all lies in one, but for rounding
-            f = math.sqrt(h2 / (1.0 - g2)) if h2 > SLACK * SLACK else 0.0
-            s += f * gs
-            t += f * gt
-            if s >= 0.0 and t >= 0.0 and s + t <= 1.0:
-                e = qq - 2.0 * (s * qu + t * qv) + s * s * uu + 2.0 * s * t * uv + t * t * vv
-                return math.sqrt(max(e, 0.0)) - (r + s * rb + t * rc), s, t
-    # The distance is convex over the triangle's plane: its least value within is on an edge that the least value
-    # in the whole plane lies beyond.
-    best = 1e9
-    wb = wc = 0.0
-    if t < 0.0:
-        best, wb = _on_edge(qq, qu, uu, r, rb)
-    if s < 0.0:
-        d, w = _on_edge(qq, qv, vv, r, rc)
-        if d < best:
-            best, wb, wc = d, 0.0, w
-    if not known or s + t > 1.0:
-        d, w = _on_edge(qq - 2.0 * qu + uu, qv - qu - uv + uu, uu - 2.0 * uv + vv, r + rb, rc - rb)
-        if d < best:
-            best, wb, wc = d, 1.0 - w, w
-    return best, wb, wc
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]

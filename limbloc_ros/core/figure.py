@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from limbloc_ros.core import _figure_kernels as kernels
+from limbloc_ros.core import _part_kernels as part_kernels
 from limbloc_ros.core._figure_topology import (
     BONES,
     CLOTHING,
@@ -237,4 +238,4 @@ def place_jacobian(state: FigureState) -> Array:
 
 def flesh_distance(query: Array, flesh: Flesh) -> tuple[Array, NDArray[np.int64]]:
     """Signed distance [Q] (m) of points [Q, 3] to the flesh, and the index of the nearest part [Q]."""
-    return kernels.flesh_distance(query, flesh.parts, flesh.centres, flesh.radii)  # type: ignore[no-any-return]
+    return part_kernels.flesh_distance(query, flesh.parts, flesh.centres, flesh.radii)  # type: ignore[no-any-return]
