@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patheffects import withStroke
 
 from limbloc_ros.core.pose import Array
 from limbloc_ros.report.plots import (
@@ -70,9 +71,10 @@ def trajectories(run: RunData) -> Figure:
             row.set_ylabel(f"{text}, z (m)")
             low, high = row.get_ylim()
             if high - low < 0.2:
-                row.set_ylim((low + high) / 2 - 0.1, (low + high) / 2 + 0.1)
-        rows[0].set_title("heights over the floor")
+                low, high = (low + high) / 2 - 0.1, (low + high) / 2 + 0.1
+            row.set_ylim(low, high + (0.3 * (high - low) if row is rows[1] else 0.0))  # the legend above the lines
         rows[1].legend(loc="upper right", ncols=2, fontsize=10.5)
+        rows[0].set_title("heights over the floor")
         rows[-1].set_xlabel(unit)
     return figure
 
@@ -140,4 +142,5 @@ def _time_marks(axes: Any, run: RunData, path: Array) -> None:
     for mark in np.arange(step, total + 1e-9, step):
         at = seen[np.argmin(np.abs(seconds[seen] - seconds[seen[0]] - mark))]
         axes.plot(*path[at, :2], "o", color=INK, markersize=5, zorder=5)
-        axes.annotate(f"{mark:.0f} s", path[at, :2], xytext=(6, 5), textcoords="offset points", fontsize=10, zorder=6)
+        text = axes.annotate(f"{mark:.0f} s", path[at, :2], xytext=(6, 5), textcoords="offset points", zorder=6)
+        text.set(fontsize=10, path_effects=[withStroke(linewidth=2.5, foreground="white")])
