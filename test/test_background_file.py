@@ -124,6 +124,19 @@ def test_recapturing_forgets_the_file(tmp_path: Path) -> None:
         graph.close()
 
 
+def test_a_file_that_cannot_be_removed_is_a_fault_and_no_end(tmp_path: Path) -> None:
+    (tmp_path / "cam0.npz").mkdir()  # as if the folder were not ours
+    graph = Graph()
+    try:
+        node = graph.add(SegmentationNode, camera="cam0", state_folder=str(tmp_path))
+        diagnostics = graph.diagnostics()
+        assert graph.call(Trigger, "segmentation/recapture_background", Trigger.Request()).success
+        graph.until(diagnostics.says("segmentation: mask", "cam0.npz cannot be removed"))
+        assert node.model.learning
+    finally:
+        graph.close()
+
+
 def test_a_killed_camera_process_does_not_learn_the_person_as_background(tmp_path: Path) -> None:
     """Killed and started again while somebody stands before the wall: the first mask already shows him."""
     parameters = {

@@ -6,6 +6,7 @@ from __future__ import annotations
 import time
 from array import array
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -265,6 +266,16 @@ def test_some_cameras_of_the_rig(graph: Graph, rig: Rig, rig_file: str, person: 
     cameras = Cameras(graph, node.rig.names)
     three = {name: person[name] for name in node.rig.names}
     assert_same_hull(cameras.hull(three, 0), Carver(rig).carve(three))
+
+
+def test_a_rig_that_cannot_be_carved_with_leaves_the_old_one(graph: Graph, rig: Rig, rig_file: str) -> None:
+    """As CameraInfo may bring one while the node runs."""
+    node = graph.add(CarvingNode, rig_file=rig_file)
+    before = (node.rig, node.carver, node.synchroniser)
+    impossible = replace(rig.cameras[0], distortion=np.array([-1e6, 0.0, 0.0, 0.0]), distortion_model="radtan")
+    with pytest.raises(RigError, match="impossible"):
+        node.use_rig(replace(rig, cameras=(impossible, *rig.cameras[1:])))
+    assert (node.rig, node.carver, node.synchroniser) == before
 
 
 def test_live_parameters(graph: Graph, rig_file: str) -> None:

@@ -3,11 +3,13 @@
 
 import csv
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from limbloc_ros.core.errors import InputError, NoPerson, OutputError
+from limbloc_ros.core.people import Body
 from limbloc_ros.core.pose import JOINT_NAMES, Flesh, Pose
 from limbloc_ros.recordings.checkpoint import FLUSH_FRAMES, Checkpoint, fingerprint
 from limbloc_ros.recordings.kept_frames import CAPACITY, KeptFrames
@@ -120,6 +122,19 @@ def test_nothing_is_lost_when_writing_fails(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="cannot be written: Not a directory"):
         run.save(tmp_path / "file" / "out")
+
+
+def test_people_of_an_earlier_run_in_the_same_folder_are_forgotten(tmp_path):
+    frames = make_frames()
+    together = [replace(frame, others=(Body(2, make_pose(9)),)) for frame in frames]
+    Run(tuple(together)).save(tmp_path)
+    (tmp_path / "people" / "p2" / "notes.txt").write_text("ours")
+    assert Run.load(tmp_path).numbers == (1, 2)
+    Run(tuple(frames)).save(tmp_path)
+    assert Run.load(tmp_path).numbers == (1,)
+    assert [path.name for path in tmp_path.glob("people/*/*")] == ["notes.txt"]  # what is not the run's own stays
+    Run(tuple(make_frames(7))).save(tmp_path)  # another recording
+    assert len(Run.load(tmp_path)) == 7
 
 
 def test_no_run_or_a_damaged_one(tmp_path):

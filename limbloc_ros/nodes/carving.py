@@ -96,11 +96,15 @@ class CarvingNode(Node):
         return topics.mask(camera) if raw else topics.mask_compressed(camera)
 
     def use_rig(self, rig: Rig) -> None:
-        """Carve with this rig from now on."""
-        self.rig = rig
-        self.backlog.clear()
+        """Carve with this rig from now on.
+
+        Raises:
+            RigError: a lens that cannot be; the rig before stays in use.
+        """
         self.carver = Carver(rig, self.hull_config)
         self.synchroniser = StampSynchroniser.from_config(rig.names, self.sync_config, self.hull_config.min_cameras)
+        self.rig = rig
+        self.backlog.clear()
         self.get_logger().info(f"carving with {len(rig.cameras)} cameras: {', '.join(rig.names)}")
 
     def make_callback(self, camera: str) -> Callable[[Image | CompressedImage], None]:

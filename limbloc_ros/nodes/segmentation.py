@@ -180,8 +180,11 @@ class SegmentationNode(Node):
     def forget_background(self) -> None:
         """What was saved is no longer to be used."""
         self.saved_s = None
-        if self.state_file is not None:
-            self.state_file.unlink(missing_ok=True)
+        try:
+            if self.state_file is not None:
+                self.state_file.unlink(missing_ok=True)
+        except OSError as error:
+            self.health.fault("background", f"{self.state_file} cannot be removed: {error.strerror}; remove it")
 
     def on_recapture(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Learn the background anew from the next images."""

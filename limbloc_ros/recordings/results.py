@@ -17,11 +17,12 @@ each row is). Then `joints.npz` also has everybody: `people` [P] ids, `people_jo
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import io
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -30,7 +31,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from limbloc_ros.core.errors import InputError, NoPerson
+from limbloc_ros.core.errors import InputError, NoPerson, OutputError
 from limbloc_ros.core.people import Body
 from limbloc_ros.core.pose import JOINT_NAMES, Flesh, Pose
 from limbloc_ros.files import ADVICE, replaced
@@ -149,15 +150,16 @@ class Run:
         return np.array(rows, dtype=np.float64).reshape(len(rows), *np.shape(nothing))
 
     def save(self, folder: str | Path) -> None:
-        """Write all four files into `folder`, which is made if need be.
+        """Write all four files into `folder`, which is made if need be; they replace those of an earlier run.
 
         Raises:
             OutputError: the folder cannot be written to (a full disk, no permission).
         """
         folder = Path(folder)
-        if self.numbers != (1,):
-            for number in self.numbers:
-                self.of(number).save_alone(folder / PEOPLE / person_id(number))
+        alone = () if self.numbers == (1,) else self.numbers
+        for number in alone:
+            self.of(number).save_alone(folder / PEOPLE / person_id(number))
+        _forget_people(folder, {person_id(number) for number in alone})
         self.save_alone(folder)
 
     def save_alone(self, folder: Path) -> None:
@@ -227,6 +229,8 @@ class Run:
 
 #: Folder of the single people's runs within a run's.
 PEOPLE = "people"
+#: The files of a run.
+FILES = ("joints.npz", "joint_angles.csv", "run.npz", "run.json")
 
 
 def result_file(path: Path) -> AbstractContextManager[Path]:
@@ -237,6 +241,19 @@ def result_file(path: Path) -> AbstractContextManager[Path]:
 def stamp_text(stamp_ns: int) -> str:
     """A stamp in seconds with all its digits, which a float would lose: `1700000000.040000000`."""
     return f"{stamp_ns // 10**9}.{stamp_ns % 10**9:09d}"
+
+
+def _forget_people(folder: Path, present: Collection[str]) -> None:
+    """Remove the files of people whom an earlier run found here; else they would be taken for this run's."""
+    for other in (folder / PEOPLE).glob("p*"):
+        if other.name not in present:
+            try:
+                for name in FILES:
+                    (other / name).unlink(missing_ok=True)
+            except OSError as error:
+                raise OutputError(f"{other} of an earlier run cannot be removed: {error.strerror}; remove it") from None
+            with contextlib.suppress(OSError):  # something of somebody else is left in it
+                other.rmdir()
 
 
 def person_id(number: int) -> str:
