@@ -7,6 +7,7 @@ python examples/slow_down_near_hand.py --ros-args -p robot:="[1.0, 0.5, 0.4]"   
 import numpy as np
 from geometry_msgs.msg import PoseArray, Twist
 from rclpy.node import Node
+from rclpy.time import Time
 
 from limbloc_ros.core.pose import JOINT
 from limbloc_ros.ros.node_main import main
@@ -29,7 +30,7 @@ class SlowDown(Node):
             places = np.array([(p.position.x, p.position.y, p.position.z) for p in msg.poses])[HANDS]
             nearest = np.linalg.norm(places - self.robot, axis=1).min()
             self.share = float(np.clip((nearest - STOP_M) / (FREE_M - STOP_M), 0.0, 1.0))
-            self.seen = self.get_clock().now()
+            self.seen = Time.from_msg(msg.header.stamp)  # when the images were taken, not when we heard of it
 
     def on_wanted(self, msg):
         age = (self.get_clock().now() - self.seen).nanoseconds * 1e-9

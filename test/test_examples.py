@@ -51,15 +51,18 @@ def test_the_robot_slows_down_near_a_hand(graph):
             assert speeds[-1].angular.z == pytest.approx(0.2)  # it may turn
             return speeds[-1].linear.x
 
-        def hand_at(distance):
+        def hand_at(distance, age_s=0.0):
             joints = np.full((len(JOINT_NAMES), 3), 5.0)
             joints[JOINT["fingertip_R"]] = (1.0, distance, 1.0)
-            return joints_to_message(joints, make_header(graph.tester.get_clock().now().nanoseconds, "room"))
+            stamp = graph.tester.get_clock().now().nanoseconds - round(age_s * 1e9)
+            return joints_to_message(joints, make_header(stamp, "room"))
 
         assert ask(None) == 0.0  # nobody knows where hands are
         assert ask(hand_at(2.0)) == pytest.approx(0.5)
         assert ask(hand_at(0.8)) == pytest.approx(0.25)
         assert ask(hand_at(0.2)) == 0.0
+        assert ask(hand_at(2.0)) == pytest.approx(0.5)
+        assert ask(hand_at(2.0, age_s=0.8)) == 0.0  # it was old when it came
         assert ask(hand_at(2.0)) == pytest.approx(0.5)
         time.sleep(0.6)  # the posture grows old
         assert ask(PoseArray()) == 0.0  # and an unreliable one does not renew it
