@@ -21,6 +21,7 @@ from limbloc_ros.core.pose import Pose
 from limbloc_ros.core.silhouettes import measure_silhouettes, pack_cameras
 from limbloc_ros.core.surface import extract_surface
 from limbloc_ros.core.tracker import Tracker
+from limbloc_ros.core.unexplained import UNEXPLAINED_M, unexplained_m
 
 #: A hull that the carve volume's walls cut by more than this, m^2, is no whole person; an arm is thinner.
 CUT_M2 = 0.02
@@ -93,7 +94,9 @@ class PoseEstimator:
         clock.lap("fit")
         if fit is None:
             return NoPerson("the hull holds nothing that a torso fits into")
-        return _whole(describe_pose(fit.state, hull, fit.system, clock.stage_ms, fit.rivals), hull)
+        pose = _whole(describe_pose(fit.state, hull, fit.system, clock.stage_ms, fit.rivals), hull)
+        explained = unexplained_m(hull, surface, pose.flesh) < UNEXPLAINED_M
+        return dataclasses.replace(pose, reliable=pose.reliable and explained)
 
     def reset(self) -> None:
         """Forget the last frame (a new recording, a jump back in time)."""

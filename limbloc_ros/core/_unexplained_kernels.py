@@ -1,0 +1,29 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Kernel of `unexplained`: the ray that passes a figure at the largest distance."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from numba import njit
+
+from limbloc_ros.core._surface_fit_kernels import distance_to_part, lay_out
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def farthest(points: Any, rays: Any, parts: Any, spheres: Any, radii: Any) -> float:
+    """Largest distance of a ray [Q, 3] through a point [Q, 3] to the nearest of the parts [P, 3], at least 0."""
+    rows, _ = lay_out(parts, spheres, radii)
+    most = 0.0
+    hint = 0  # what explained the point before mostly explains this one
+    for q in range(len(points)):
+        x, y, z = points[q]
+        nearest, _, _ = distance_to_part(rows[hint], x, y, z, rays[q])
+        p = 0
+        while nearest > most and p < len(rows):
+            d, _, _ = distance_to_part(rows[p], x, y, z, rays[q])
+            if d < nearest:
+                nearest, hint = d, p
+            p += 1
+        most = max(most, nearest)
+    return most

@@ -1,0 +1,45 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the outlines of the silhouettes show and a figure does not."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from limbloc_ros.core import pipeline
+from limbloc_ros.core._figure_kernels import exp_so3
+from limbloc_ros.core._unexplained_kernels import farthest
+from limbloc_ros.core.figure import BONE, FigureState, place
+from limbloc_ros.core.pipeline import Carver, PoseEstimator
+from limbloc_ros.core.surface import extract_surface
+from limbloc_ros.core.unexplained import UNEXPLAINED_M, unexplained_m
+from limbloc_ros.recordings.cases import load_case
+
+WALK = Path(__file__).parent / "data" / "benchmark" / "public" / "seq_walk_circle"
+
+
+def test_rays_beside_a_ball_and_through_it():
+    ball = (np.zeros((1, 3), np.int64), np.zeros((1, 3)), np.array([0.1]))
+    points = np.array([[0.3, 0.0, 0.0], [0.3, 0.0, 0.0], [0.0, 0.0, 0.25]])
+    across, through = np.array([0.0, 1.0, 0.0]), np.array([1.0, 0.0, 0.0])
+    assert farthest(points[:1], across[None], *ball) == pytest.approx(0.2)
+    assert farthest(points[1:2], through[None], *ball) == 0.0
+    assert farthest(points, np.stack([through, through, across]), *ball) == pytest.approx(0.15)
+    assert farthest(points[:0], points[:0], *ball) == 0.0
+
+
+def test_an_arm_elsewhere_is_not_explained_and_the_pose_not_reliable(monkeypatch):
+    case = load_case(WALK)
+    hull = Carver(case.rig).carve(case.masks(20))
+    pose = PoseEstimator().estimate(hull)
+    surface = extract_surface(hull)
+    assert pose.reliable
+    assert unexplained_m(hull, surface, pose.flesh) < 0.6 * UNEXPLAINED_M
+    state = FigureState.from_vector(pose.parameters)
+    state.rotations[[BONE["upper_arm_L"], BONE["forearm_L"], BONE["hand_L"]]] @= exp_so3(np.array([0.0, -1.2, 0.0]))
+    assert unexplained_m(hull, surface, place(state).flesh()) > UNEXPLAINED_M
+    unknown = dataclasses.replace(hull, cut_by=None)
+    assert unexplained_m(unknown, surface, place(state).flesh()) == 0.0
+    monkeypatch.setattr(pipeline, "UNEXPLAINED_M", 0.01)
+    assert not PoseEstimator().estimate(hull).reliable
