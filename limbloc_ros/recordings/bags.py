@@ -417,7 +417,7 @@ class _Healthy:
 def _salvaged_topic(name: str, kind: str, qos_yaml: str) -> BagTopic:
     try:
         profiles = parse_qos(qos_yaml)
-    except (ReaderError, KeyError, TypeError):
+    except (ReaderError, KeyError, TypeError, AttributeError):
         profiles = []  # a damaged bag may have lost them; the defaults suit every topic
     return BagTopic(name, kind, 0, *_offered(profiles))
 
