@@ -7,7 +7,7 @@ from typing import Any
 
 from numba import njit
 
-from limbloc_ros.core._surface_fit_kernels import distance_to_part, lay_out
+from limbloc_ros.core._part_kernels import distance_to_part, lay_out
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
