@@ -418,3 +418,32 @@ def grow_part(part: Any, reach: int) -> Any:
                 for k in range(nz):
                     grown[k] |= row[k]
     return out
+
+
+@njit(cache=True, nogil=True)  # type: ignore[misc, unused-ignore]
+def voxels_below(sdf: Any, limit: Any, first: Any) -> tuple[Any, Any]:
+    """Lattice indices int32 [V, 3] and values [V] of the voxels below `limit`, in array order.
+
+    Args:
+        sdf: [X, Y, Z] C-contiguous.
+        limit: of its type.
+        first: [3] lattice index of the first voxel.
+    """
+    flat = sdf.ravel()
+    count = 0
+    for n in range(flat.size):
+        count += flat[n] < limit
+    indices = np.empty((count, 3), np.int32)
+    values = np.empty(count, sdf.dtype)
+    at = 0
+    for i in range(sdf.shape[0]):
+        for j in range(sdf.shape[1]):
+            row = sdf[i, j]
+            for k in range(sdf.shape[2]):
+                if row[k] < limit:
+                    indices[at, 0] = first[0] + i
+                    indices[at, 1] = first[1] + j
+                    indices[at, 2] = first[2] + k
+                    values[at] = row[k]
+                    at += 1
+    return indices, values

@@ -100,9 +100,8 @@ class Hull:
         Returns:
             lattice indices int32 [V, 3] and signed distances float32 [V] m, all below band_m, in array order.
         """
-        local = np.stack(np.nonzero(self.sdf < np.float32(self.band_m)), axis=1)
-        values = self.sdf[local[:, 0], local[:, 1], local[:, 2]]
-        return (local + np.asarray(self.index_min)).astype(np.int32), values
+        first = np.asarray(self.index_min)
+        return kernels.voxels_below(self.sdf, np.float32(self.band_m), first)  # type: ignore[no-any-return]
 
     @staticmethod
     def from_shell(

@@ -49,19 +49,12 @@ _SURFACE_FIELDS = _fields(SURFACE_POINT)
 
 
 def _cloud(points: NDArray[np.void], fields: list[PointField], header: Header) -> PointCloud2:
+    msg = PointCloud2(header=header, height=1, width=len(points), fields=fields, is_dense=True)
+    msg.point_step, msg.row_step = points.dtype.itemsize, points.nbytes
     data = array("B")
     data.frombytes(points.view(np.uint8).data)
-    return PointCloud2(
-        header=header,
-        height=1,
-        width=len(points),
-        fields=fields,
-        is_bigendian=False,
-        point_step=points.dtype.itemsize,
-        row_step=len(data),
-        data=data,
-        is_dense=True,
-    )
+    msg.data = data  # the constructor would copy it byte by byte
+    return msg
 
 
 def check_voxel_size(voxel_m: float, band_m: float) -> None:
@@ -88,22 +81,23 @@ def hull_to_cloud(hull: Hull, header: Header) -> PointCloud2:
             f"the hull's voxels have indices {indices.min()} to {indices.max()}; expected -32768 to 32767: "
             "move the world's origin into the room, or use larger voxels"
         )
-    points = np.zeros(len(indices), HULL_POINT)
-    centres = (indices + 0.5) * hull.voxel_m
-    for axis in range(3):
-        points["xyz"[axis]] = centres[:, axis]
-        points["ijk"[axis]] = indices[:, axis]
-    points["sdf"] = sdf
-    points["voxel_um"] = round(hull.voxel_m * 1e6)
-    points["band_um"] = round(hull.band_m * 1e6)
-    points["camera"] = NOBODY
+    # Columns of four bytes each, which are written three times as fast as the fields of a structured array.
+    words = np.empty((len(indices), HULL_POINT.itemsize // 4), np.uint32)
+    numbers = words.view(np.float32)
+    numbers[:, 0:3] = (indices + 0.5) * hull.voxel_m
+    numbers[:, 3] = sdf
+    halves = words.view(np.uint16)
+    halves[:, 8:11] = indices  # modulo 2^16, as int16 has it
+    halves[:, 11] = NOBODY
+    words[:, 6] = round(hull.voxel_m * 1e6)
+    words[:, 7] = round(hull.band_m * 1e6)
+    numbers[:, 8:11] = 0.0
     if hull.cut_by is not None and len(hull.viewpoints):
         cut_by = hull.cut_by[hull.sdf < np.float32(hull.band_m)]
         known = cut_by < len(hull.viewpoints)
-        points["camera"] = np.where(known, cut_by, NOBODY)
-        viewpoints = hull.viewpoints[np.where(known, cut_by, 0)]
-        for axis in range(3):
-            points["vp_" + "xyz"[axis]] = viewpoints[:, axis]
+        halves[:, 11] = np.where(known, cut_by, NOBODY)
+        numbers[:, 8:11] = hull.viewpoints[np.where(known, cut_by, 0)]
+    points = words.view(HULL_POINT)[:, 0]
     return _cloud(points, _HULL_FIELDS, header)
 
 
