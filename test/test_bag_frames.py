@@ -118,6 +118,23 @@ def test_a_damaged_message_is_an_input_error(tmp_path):
             s.items["cam1"].pixels()
 
 
+def test_a_message_without_a_header_costs_its_frame_alone(tmp_path):
+    def cut(camera, k, header):
+        return b"" if (camera, k) == (1, 2) else jpeg(camera, k, header)
+
+    write(tmp_path / "bag", cut, "image_raw/compressed", COMPRESSED)
+    damaged = {}
+    with BagReader(tmp_path / "bag") as bag:
+        sets = list(frame_sets(bag, camera_streams(bag, CAMERAS), damaged=damaged))
+    assert [s.missing for s in sets] == [(), (), ("cam1",), (), ()]
+    assert damaged == {"cam1": 1}
+    with (
+        BagReader(tmp_path / "bag") as bag,
+        pytest.raises(InputError, match="/cam1/image_raw/compressed: expected a CDR"),
+    ):
+        list(frame_sets(bag, camera_streams(bag, CAMERAS)))
+
+
 def test_header_stamps_are_read_without_decoding():
     header = Header(frame_id="x")
     header.stamp.sec, header.stamp.nanosec = 1_700_000_000, 123_456_789

@@ -282,13 +282,14 @@ def test_a_companion_whose_type_is_not_installed_is_left_out(make, context, tmp_
     assert "replayed 2 messages of 1 topics" in replay.summary()
 
 
-def test_damaged_messages_are_left_out_and_counted(make, context, tmp_path):
+@pytest.mark.parametrize("mode", ["realtime", "stepped"])
+def test_damaged_messages_are_left_out_and_counted(make, context, tmp_path, mode):
     with BagWriter(tmp_path / "bag") as bag:
         bag.add_topic("/cam0/image_raw", IMAGE)
         for k in range(4):
             cdr = serialize_message(image(0, k))
             bag.write("/cam0/image_raw", T0 + k, cdr[:100] if k == 1 else b"garbage" if k == 2 else cdr)
-    replay = make(ReplayNode, bag=str(tmp_path / "bag"), wait_for_subscribers_s=0.0)
+    replay = make(ReplayNode, bag=str(tmp_path / "bag"), wait_for_subscribers_s=0.0, mode=mode)
     assert spin([replay], context, until=replay.done.is_set, timeout_s=20)
     assert (replay.published, replay.invalid) == (2, 2)
     assert "2 damaged messages left out" in replay.summary()

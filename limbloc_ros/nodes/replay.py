@@ -261,11 +261,15 @@ class ReplayNode(Node):
         )
         companions: list[BagMessage] = []
         for message in self._messages():
-            if message.topic in self._pixels:
-                sets = synchroniser.add(message.topic, header_stamp_ns(message.cdr, message.topic), message)
-            else:
+            if message.topic not in self._pixels:
                 companions.append(message)
-                sets = []
+                continue
+            try:
+                stamp = header_stamp_ns(message.cdr, message.topic)
+            except InputError as error:
+                self._leave_out(error)
+                continue
+            sets = synchroniser.add(message.topic, stamp, message)
             for frame_set in sets:
                 companions = self._step(frame_set.stamp_ns, frame_set.skew_ns, frame_set.items, companions)
             if self._stop.is_set():
@@ -315,12 +319,15 @@ class ReplayNode(Node):
         try:
             check_cdr(self._selected[message.topic].type, message.cdr, message.topic)
         except InputError as error:
-            self.invalid += 1
-            self.get_logger().error(f"left out a damaged message: {error}", throttle_duration_sec=5.0)
+            self._leave_out(error)
             return
         self._publish_clock()
         self._outputs[message.topic].publish(message.cdr)
         self.published += 1
+
+    def _leave_out(self, error: InputError) -> None:
+        self.invalid += 1
+        self.get_logger().error(f"left out a damaged message: {error}", throttle_duration_sec=5.0)
 
     def _publish_clock(self) -> None:
         if self._clock is None or self._stop.is_set():

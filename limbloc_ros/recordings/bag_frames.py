@@ -85,6 +85,7 @@ def frame_sets(
     sync: SyncConfig | None = None,
     min_cameras: int = 1,
     synchroniser: StampSynchroniser[BagFrame] | None = None,
+    damaged: dict[str, int] | None = None,
 ) -> Iterator[FrameSet[BagFrame]]:
     """Frames of one instant, in the order of their stamps, by the rules of the live carving node.
 
@@ -94,13 +95,23 @@ def frame_sets(
         sync: slop and queue.
         min_cameras: smaller sets are dropped.
         synchroniser: used in place of one made from `sync` and `min_cameras`, to read its counters afterwards.
+        damaged: camera -> messages without a readable header, which are left out and counted here.
+
+    Raises:
+        InputError: such a message, when `damaged` is None.
     """
     if synchroniser is None:
         synchroniser = StampSynchroniser.from_config(tuple(streams), sync or SyncConfig(), min_cameras)
     by_topic = {stream.topic: stream for stream in streams.values()}
     for message in bag.messages(by_topic):
         stream = by_topic[message.topic]
-        stamp_ns = header_stamp_ns(message.cdr, message.topic)
+        try:
+            stamp_ns = header_stamp_ns(message.cdr, message.topic)
+        except InputError:
+            if damaged is None:
+                raise
+            damaged[stream.camera] = damaged.get(stream.camera, 0) + 1
+            continue
         yield from synchroniser.add(stream.camera, stamp_ns, BagFrame(stream, stamp_ns, message.cdr))
     yield from synchroniser.flush()
 

@@ -130,7 +130,7 @@ class BagSource:
         )
         damaged: dict[str, int] = {}
         with BagReader(self._path) as bag:
-            for frames in frame_sets(bag, self._streams, synchroniser=synchroniser):
+            for frames in frame_sets(bag, self._streams, synchroniser=synchroniser, damaged=damaged):
                 start = time.process_time()
                 masks: dict[str, Pixels] = {}
                 images: dict[str, Pixels] = {}
