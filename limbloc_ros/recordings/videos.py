@@ -99,6 +99,10 @@ class ImageFolder:
         self._by_number = dict(by_number)
         self.numbers: Sequence[int] = list(self._by_number)
 
+    def file(self, number: int) -> Path | None:
+        """The picture with this number, None if there is none."""
+        return self._by_number.get(number)
+
     def read(self, wanted: Sequence[int]) -> Iterator[tuple[int, Pixels]]:
         """Reads only what is wanted."""
         for number in wanted:
