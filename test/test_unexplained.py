@@ -11,6 +11,7 @@ from limbloc_ros.core import pipeline
 from limbloc_ros.core._figure_kernels import exp_so3
 from limbloc_ros.core._unexplained_kernels import farthest
 from limbloc_ros.core.figure import BONE, FigureState, place
+from limbloc_ros.core.parts import Part
 from limbloc_ros.core.pipeline import Carver, PoseEstimator
 from limbloc_ros.core.surface import extract_surface
 from limbloc_ros.core.unexplained import UNEXPLAINED_M, unexplained_m
@@ -39,6 +40,9 @@ def test_an_arm_elsewhere_is_not_explained_and_the_pose_not_reliable(monkeypatch
     state = FigureState.from_vector(pose.parameters)
     state.rotations[[BONE["upper_arm_L"], BONE["forearm_L"], BONE["hand_L"]]] @= exp_so3(np.array([0.0, -1.2, 0.0]))
     assert unexplained_m(hull, surface, place(state).flesh()) > UNEXPLAINED_M
+    # What somebody else explains, this figure need not; a part of a hull explains its own outlines.
+    assert unexplained_m(hull, surface, place(state).flesh(), [pose.flesh]) < 0.6 * UNEXPLAINED_M
+    assert unexplained_m(hull, surface, place(state).flesh(), [Part.of(hull).filling()]) < 0.2 * UNEXPLAINED_M
     unknown = dataclasses.replace(hull, cut_by=None)
     assert unexplained_m(unknown, surface, place(state).flesh()) == 0.0
     monkeypatch.setattr(pipeline, "UNEXPLAINED_M", 0.01)

@@ -214,7 +214,7 @@ class Live:
         stamp, joints = stamp_ns(msg.header), message_to_joints(msg)
         truth = self.cameras.truth.get(stamp)
         self.answers.append(
-            Answer(time.monotonic(), stamp, joints is not None, _error(joints, truth), truth is not None)
+            Answer(time.monotonic(), stamp, joints is not None, error_of(joints, truth), truth is not None)
         )
 
     def _on_diagnostics(self, msg: DiagnosticArray) -> None:
@@ -236,7 +236,8 @@ def steady(answers: list[Answer]) -> float | None:
     return None
 
 
-def _error(joints: NDArray[np.float64] | None, truth: NDArray[np.float64] | None) -> tuple[float, float]:
+def error_of(joints: NDArray[np.float64] | None, truth: NDArray[np.float64] | None) -> tuple[float, float]:
+    """Mean and largest distance, m, of the limbs' joints from the truth; as in `Answer`."""
     if joints is None:
         return float("nan"), float("nan")
     if truth is None:

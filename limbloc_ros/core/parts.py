@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from limbloc_ros.core.errors import NoPerson
 from limbloc_ros.core.hull import NOBODY, Hull, components, largest_component
 from limbloc_ros.core.pipeline import PoseEstimator
-from limbloc_ros.core.pose import Pose
+from limbloc_ros.core.pose import Flesh, Pose
 
 Array = NDArray[np.float64]
 
@@ -48,6 +48,13 @@ class Part:
         return Part(centres[:: max(1, len(local) // POINTS)], centres.mean(axis=0), len(local) * hull.voxel_m**3)
 
 
+    def filling(self) -> Flesh:
+        """It as balls, one around each of the points."""
+        radius = (self.volume_m3 / len(self.points)) ** (1 / 3)
+        rows = np.arange(len(self.points), dtype=np.int64)
+        return Flesh(self.points, np.full(len(rows), radius), np.stack([rows, rows, rows], axis=1), ())
+
+
 @dataclass(frozen=True)
 class Sight:
     """The parts of one frame's hull, the largest first.
@@ -70,7 +77,11 @@ class Sight:
 
     def fit(self, n: int, estimator: PoseEstimator) -> Pose | NoPerson:
         """The pose of part n, by itself."""
-        return self.outcomes[n] if self.outcomes else estimator.estimate(self.hulls()[n])
+        return self.outcomes[n] if self.outcomes else estimator.estimate(self.hulls()[n], self.others(n))
+
+    def others(self, n: int) -> list[Flesh]:
+        """What the parts but n explain of the silhouettes, whoever or whatever they are."""
+        return [part.filling() for m, part in enumerate(self.parts) if m != n]
 
 
 def candidates(hull: Hull, max_people: int) -> list[Hull]:

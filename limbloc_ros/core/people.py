@@ -271,6 +271,7 @@ class People:
                     newcomers.append((track, n))
                 continue
             pieces = divide(sight.hulls()[n], [_distance(track, stamp_ns) for track in claimants])
+            bodies = [(track, track.flesh(stamp_ns)) for track in claimants]
             for track, piece in zip(claimants, pieces, strict=True):
                 if piece is None:
                     continue
@@ -279,7 +280,8 @@ class People:
                     track.seen_ns, track.shared = stamp_ns, True
                     continue
                 track.see(Part.of(piece), stamp_ns, shared=True)
-                fits.append((track, partial(track.estimator.estimate, piece)))
+                others = [flesh for other, flesh in bodies if flesh is not None and other is not track]
+                fits.append((track, partial(track.estimator.estimate, piece, others + sight.others(n))))
         # Fits from scratch take as long as many followed frames: one newcomer in each frame, who has waited longest.
         newcomers.sort(key=lambda entry: entry[0].looked_ns or 0)
         for track, n in newcomers[: 1 if self.config.temporal else None]:

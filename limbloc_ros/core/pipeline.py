@@ -6,7 +6,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ from limbloc_ros.core.confidence import describe_pose
 from limbloc_ros.core.config import FitConfig, HullConfig, validated
 from limbloc_ros.core.errors import NoPerson
 from limbloc_ros.core.hull import Hull, carve_silhouettes, largest_component
-from limbloc_ros.core.pose import Pose
+from limbloc_ros.core.pose import Flesh, Pose
 from limbloc_ros.core.silhouettes import measure_silhouettes, pack_cameras
 from limbloc_ros.core.surface import extract_surface
 from limbloc_ros.core.tracker import Tracker
@@ -73,8 +73,13 @@ class PoseEstimator:
         self.config = validated(config or FitConfig())
         self._tracker = Tracker(self.config.seed)
 
-    def estimate(self, hull: Hull) -> Pose | NoPerson:
-        """Fit the figure to one hull; of a hull in several parts to the largest."""
+    def estimate(self, hull: Hull, others: Sequence[Flesh] = ()) -> Pose | NoPerson:
+        """Fit the figure to one hull; of a hull in several parts to the largest.
+
+        Args:
+            hull: the frame's, or one person's part of it.
+            others: where other people are now; what they explain of the silhouettes, this figure need not.
+        """
         if hull.inside_count == 0:
             return NoPerson("the hull holds no voxel: is anybody in the carve volume?")
         hull = largest_component(hull)
@@ -95,7 +100,7 @@ class PoseEstimator:
         if fit is None:
             return NoPerson("the hull holds nothing that a torso fits into")
         pose = _whole(describe_pose(fit.state, hull, fit.system, clock.stage_ms, fit.rivals), hull)
-        explained = unexplained_m(hull, surface, pose.flesh) < UNEXPLAINED_M
+        explained = unexplained_m(hull, surface, pose.flesh, others) < UNEXPLAINED_M
         return dataclasses.replace(pose, reliable=pose.reliable and explained)
 
     def reset(self) -> None:

@@ -8,6 +8,8 @@ outline of some silhouette, and the body touches that ray; so does a figure that
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from limbloc_ros.core._unexplained_kernels import farthest
@@ -24,14 +26,20 @@ UNEXPLAINED_M = 0.11
 EVERY = 2
 
 
-def unexplained_m(hull: Hull, surface: Surface, flesh: Flesh) -> float:
+def unexplained_m(hull: Hull, surface: Surface, flesh: Flesh, others: Sequence[Flesh] = ()) -> float:
     """The largest distance, m, at which the outline of a silhouette passes a figure.
 
     Args:
         hull, surface: what the figure was fitted to. Where nobody knows which camera cut the hull, nothing is asked.
         flesh: of the figure.
+        others: of other people in the room, whose outlines cut this hull as well.
     """
+    everybody = (flesh, *others)
+    firsts = np.cumsum([0, *(len(body.centres) for body in everybody)])
+    parts = np.concatenate([body.parts + first for body, first in zip(everybody, firsts, strict=False)])
+    centres = np.concatenate([body.centres for body in everybody])
+    radii = np.concatenate([body.radii for body in everybody])
     rows = np.arange(0, len(surface), EVERY)
     rays = outline_rays(hull, surface, rows)
     known = rays.any(axis=1)
-    return float(farthest(surface.points[rows[known]], rays[known], flesh.parts, flesh.centres, flesh.radii))
+    return float(farthest(surface.points[rows[known]], rays[known], parts, centres, radii))

@@ -247,7 +247,7 @@ class _Fitter:
         seen = self.look(job)
         if isinstance(seen.sight, NoPerson):
             return _Fitted(job.stamp_ns, (), (), seen.sight.reason, seen.stage_ms)
-        outcomes = tuple(self._estimator.estimate(hull) for hull in seen.sight.hulls())
+        outcomes = tuple(seen.sight.fit(n, self._estimator) for n in range(len(seen.sight.parts)))
         return _Fitted(job.stamp_ns, seen.sight.parts, outcomes, "", seen.stage_ms)
 
     def back(self, fitted: _Fitted, job: _Job) -> _Seen:
