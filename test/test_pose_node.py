@@ -149,7 +149,7 @@ def test_a_new_urdf_only_for_notable_changes(graph: Graph, hull: Hull, offline: 
 
     def fitted(change_m: float, n: int) -> int:
         sizes = {**offline.sizes, name: offline.sizes[name] + change_m}
-        node.estimator.estimate = lambda _: dataclasses.replace(offline, sizes=sizes)
+        node.estimator.estimate = lambda *_: dataclasses.replace(offline, sizes=sizes)
         carvings.send(hull, n)
         graph.spin(0.1)
         return len(descriptions)
@@ -174,7 +174,7 @@ def test_nobody_gives_an_empty_answer_and_clears_the_figure(graph: Graph, hull: 
 
 def test_pictures_for_those_who_look(graph: Graph, hull: Hull, offline: Pose) -> None:
     node = graph.add(PoseNode)
-    node.estimator.estimate = lambda _: offline
+    node.estimator.estimate = lambda *_: offline
     carvings = Carvings(graph)
     published: list[object] = []
     node.surface.publish, original = published.append, node.surface.publish
@@ -192,7 +192,7 @@ def test_pictures_for_those_who_look(graph: Graph, hull: Hull, offline: Pose) ->
 
 def test_a_damaged_cloud_is_named_and_the_node_goes_on(graph: Graph, hull: Hull, offline: Pose) -> None:
     node = graph.add(PoseNode)
-    node.estimator.estimate = lambda _: offline
+    node.estimator.estimate = lambda *_: offline
     carvings = Carvings(graph)
     msg = hull_to_cloud(hull, make_header(T0_NS, "room"))
     msg.data = array("B", msg.data[:1000])
@@ -205,7 +205,7 @@ def test_a_damaged_cloud_is_named_and_the_node_goes_on(graph: Graph, hull: Hull,
 def test_an_unreliable_fit_is_shown_but_not_told_as_fact(graph: Graph, hull: Hull, offline: Pose) -> None:
     node = graph.add(PoseNode)
     doubtful = dataclasses.replace(offline, reliable=False, energy=0.7)
-    node.estimator.estimate = lambda _: doubtful
+    node.estimator.estimate = lambda *_: doubtful
     states, markers = graph.collect(JointState, "humans/bodies/p1/joint_states"), graph.collect(MarkerArray, "markers")
     carvings = Carvings(graph)
     graph.until(lambda: node.markers.get_subscription_count() == 1)
@@ -221,7 +221,7 @@ def test_an_unreliable_fit_is_shown_but_not_told_as_fact(graph: Graph, hull: Hul
 
 def test_a_jump_back_in_time_starts_anew(graph: Graph, hull: Hull, offline: Pose) -> None:
     node = graph.add(PoseNode)
-    node.estimator.estimate = lambda _: offline
+    node.estimator.estimate = lambda *_: offline
     resets: list[int] = []
     node.estimator.reset = lambda: resets.append(1)
     carvings = Carvings(graph)
@@ -301,11 +301,11 @@ def test_tf_and_the_list_of_bodies_where_they_exist(
     node = graph.add(PoseNode)
     tracked: list[IdsList] = []
     node.bodies._ids_list, node.bodies._tracked = IdsList, types.SimpleNamespace(publish=tracked.append)
-    node.estimator.estimate = lambda _: offline
+    node.estimator.estimate = lambda *_: offline
     descriptions = graph.collect(String, "humans/bodies/p1/urdf", topics.LATCHED_QOS)
     carvings = Carvings(graph)
     carvings.send(hull, 0)
-    node.estimator.estimate = lambda _: NoPerson("gone")
+    node.estimator.estimate = lambda *_: NoPerson("gone")
     carvings.send(hull, 1)
     assert [message.ids for message in tracked] == [["p1"], []]
     graph.until(lambda: len(descriptions) == 1)
