@@ -310,6 +310,25 @@ class TestScenes:
         np.testing.assert_array_equal(first, run())
 
 
+class TestFirstImages:
+    def test_a_camera_that_begins_with_black_images_has_colour(self):
+        """A shadow is told by its colour; three equal channels, as of a black image, would tell none."""
+        rng = np.random.default_rng(0)
+        model = BackgroundModel()
+        assert model.segment(np.zeros((HEIGHT, WIDTH, 3), np.uint8)).blind
+        while model.learning:
+            model.segment(room(rng))
+        shaded = room(rng)
+        shaded[PERSON] = (shaded[PERSON] * 0.7).astype(np.uint8)
+        assert not model.segment(shaded).mask.any()
+
+    def test_refused_parameters_change_nothing(self):
+        model = learned(np.random.default_rng(0))
+        with pytest.raises(ConfigError, match="max_pixels"):
+            model.config = dataclasses.replace(model.config, max_pixels=1)
+        assert not model.learning
+
+
 class TestSeeds:
     def test_one_picture_takes_the_noise_from_the_first_image(self):
         rng = np.random.default_rng(10)

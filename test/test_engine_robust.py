@@ -306,4 +306,4 @@ def test_nobody(name):
 def test_no_torso_without_a_medial_axis():
     hull = NOBODY["huge ball"]
     nothing = Medial(np.empty((0, 4)))
-    assert engine_robust.search.torso_hypotheses(hull, nothing, np.random.default_rng(0)) == []
+    assert engine_robust.search.torso_hypotheses(hull, nothing, np.random.default_rng(0), 6) == []

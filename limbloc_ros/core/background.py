@@ -110,9 +110,10 @@ class BackgroundModel:
 
     @config.setter
     def config(self, config: BackgroundConfig) -> None:
+        config = validated(config)
         if config.max_pixels != self._config.max_pixels:
             self.recapture()
-        self._config = validated(config)
+        self._config = config
         self._fix_model()
 
     @property
@@ -143,7 +144,10 @@ class BackgroundModel:
         return np.clip(np.rint(self._mean), 0, 255).astype(np.uint8).transpose(1, 2, 0)
 
     def freeze(self, on: bool = True) -> None:
-        """Stop (or resume) learning from background pixels. The gain of the light is still followed."""
+        """Stop (or resume) learning from background pixels.
+
+        The gain of the light is still followed; when the light is switched, there is no mask until this is undone.
+        """
         self._frozen = on
 
     def recapture(self) -> None:
@@ -294,8 +298,6 @@ class BackgroundModel:
             )
         if self._image_shape is None:
             self._image_shape = image.shape[:2]
-            sample = image[::4, ::4].astype(np.int16)
-            self._grey = image.ndim == 2 or bool((np.ptp(sample, axis=2) <= 2).all())
         elif image.shape[:2] != self._image_shape:
             height, width = self._image_shape
             raise InputError(
@@ -334,6 +336,8 @@ class BackgroundModel:
     def _allocate(self, planes: Bytes) -> None:
         self._mean = planes.astype(np.float32)
         self._variance = np.zeros_like(self._mean)
+        # Told by the first image that is learned: many a camera begins with black ones.
+        self._grey = bool((np.ptp(planes[:, ::4, ::4].astype(np.int16), axis=0) <= 2).all())
         self._busy = self._changed = np.zeros(planes.shape[1:], dtype=np.uint8)
         self._learned = 1
 

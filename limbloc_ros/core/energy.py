@@ -24,7 +24,20 @@ Array = NDArray[np.float64]
 class Weights:
     """How much each term counts, and the widths (m) within which a residual is believed.
 
-    The surface term is a mean over points, the others are sums, all in square metres.
+    The surface term is a mean over points, the others are sums, all in square metres. `x` without a suffix is the
+    weight of term x.
+
+    Attributes:
+        surface: every point of the hull's surface (or some point of its ray) is explained by the flesh;
+            `surface_inside` is how much more a point inside of the flesh counts, `normal_gate_m` by how much a part
+            whose surface looks the other way counts as further off.
+        inclusion: the flesh stays in the hull (constraint 3), but for `inclusion_slack_m`.
+        penetration: limbs stay out of other parts (constraint 5), but for `penetration_allowed` of their radii.
+        posture: joints rest in the middle of their ranges (constraint 4).
+        limits: joints stay within their ranges.
+        spine: the spine bends and twists evenly.
+        proportions: sizes are likely ones (constraints 1 and 2).
+        clothing: nobody wears loose clothes without need.
     """
 
     surface: float = 1.0
@@ -185,8 +198,7 @@ PENETRATION_PAIRS = _penetration_pairs()
 def system(state: FigureState, evidence: Evidence, weights: Weights) -> System:
     """Cost, gradient and Gauss-Newton matrix of the smooth energy at a state.
 
-    Terms: surface (every hull point explained), inclusion (constraint 3), penetration (5), posture (4), proportions
-    (1 and, through shared sizes, 2).
+    The terms are those of `Weights`.
     """
     table = figure.proportions()
     points = (

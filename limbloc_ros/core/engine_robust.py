@@ -284,8 +284,7 @@ def fit_from_scratch(
         if best is not None and effort.dressed:
             clothes = best.state.shape[figure.proportions().clothing_from :]
             some = [_wearing(torso, clothes) for torso in some]
-        found, rivals = _fit_from_torsos(some, scene, effort)
-        judged = _judged(found, scene)
+        found, rivals, judged = _fit_from_torsos(some, scene, effort)
         if best is None or judged < best.judged:
             best = Fit(found.state, found.system, rivals, judged)
         if best.judged < effort.enough:
@@ -318,8 +317,9 @@ def _wearing(state: FigureState, clothes: Array) -> FigureState:
     return FigureState(state.root, state.rotations, shape)
 
 
-def _fit_from_torsos(torsos: list[FigureState], scene: Scene, effort: Effort) -> tuple[Refined, Rivals]:
-    first, second, repair, strict, final = effort.iterations
+def _fit_from_torsos(torsos: list[FigureState], scene: Scene, effort: Effort) -> tuple[Refined, Rivals, float]:
+    """The best figure of one search, its rivals, and the energy by which it is judged."""
+    first, second, repair, limited, final = effort.iterations
     quick, lenient = scene.quick, scene.lenient
     starts = _with_limbs(torsos, scene, effort)
     tried = [refine(state, quick, lenient, first) for state in _cheapest(starts, scene, effort.starts)]
@@ -331,12 +331,12 @@ def _fit_from_torsos(torsos: list[FigureState], scene: Scene, effort: Effort) ->
         tried += [refine(state, quick, lenient, repair) for state in others]
     least = _best(tried, 1)[0].system.cost
     rivals = tuple((r.state, r.system.cost / least) for r in tried if r.system.cost < RIVAL_COST * least)
-    tried = [refine(r.state, quick, scene.strict, strict) for r in _best(tried, effort.strict)]
+    tried = [refine(r.state, quick, scene.strict, limited) for r in _best(tried, effort.strict)]
     finals = [refine(r.state, scene.full, scene.strict, final) for r in _best(tried, effort.finalists)]
     winner = _best(finals, 1)[0]
     winner = refine(winner.state, scene.full, scene.weights, final)
-    if effort.certain > 0.0 and _judged(winner, scene) < effort.certain:
-        return winner, rivals
+    if effort.certain > 0.0 and (judged := _judged(winner, scene)) < effort.certain:
+        return winner, rivals, judged
     for _ in range(effort.rounds):
         before = winner.system.cost
         for kind, places in ((ARM, effort.single_arms), (LEG, effort.single_legs)):
@@ -344,17 +344,17 @@ def _fit_from_torsos(torsos: list[FigureState], scene: Scene, effort: Effort) ->
                 winner = _with_better_limb(winner, scene, kind, side, places, effort)
         if winner.system.cost == before:
             break
-    return winner, rivals
+    return winner, rivals, _judged(winner, scene)
 
 
 def _with_better_limb(
     winner: Refined, scene: Scene, kind: search.LimbKind, side: str, places: int, effort: Effort
 ) -> Refined:
     """The winner, or it with one limb elsewhere if that explains the hull better: trunk and sizes are known by now."""
-    _, _, repair, strict, final = effort.iterations
+    _, _, repair, limited, final = effort.iterations
     for state in with_one_limb(winner.state, scene, kind, side, places, effort.candidates):
         settled = refine(state, scene.quick, scene.lenient, repair).state
-        other = refine(settled, scene.full, scene.weights, strict)
+        other = refine(settled, scene.full, scene.weights, limited)
         if other.system.cost < winner.system.cost:
             winner = refine(other.state, scene.full, scene.weights, final)
     return winner

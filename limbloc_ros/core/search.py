@@ -43,7 +43,14 @@ _TORSO_BONES = [name for name in figure.BONE_NAMES if not name.startswith(("fore
 
 @dataclass(frozen=True)
 class TorsoTable:
-    """The mean figure's torso in the arrays that the kernels take; lengths in units of the stature."""
+    """The mean figure's torso in the arrays that the kernels take; lengths in units of the stature.
+
+    Attributes:
+        arrays: bones' parents and offsets, spheres' bones, places and radii.
+        weights: of the spheres; the first `n_solid` must just fit into the hull, the others be empty.
+        bends: [N, 3] rotation vectors of the spine that are tried, rad.
+        axis_base, axis_tip: [N, 3] middles of pelvis and skull for each of them.
+    """
 
     arrays: tuple[NDArray[np.int64], Array, NDArray[np.int64], Array, Array]
     weights: Array
@@ -128,7 +135,7 @@ class TorsoSearch:
 
 
 def torso_hypotheses(
-    hull: Hull, medial: Medial, rng: np.random.Generator, keep: int = 6, effort: TorsoSearch | None = None
+    hull: Hull, medial: Medial, rng: np.random.Generator, keep: int, effort: TorsoSearch | None = None
 ) -> list[tuple[FigureState, float]]:
     """Torsos that fit the hull, the best first, without limbs; each stands for both of its facings.
 
@@ -228,17 +235,26 @@ def sphere_directions(count: int) -> Array:
 
 @dataclass(frozen=True)
 class LimbKind:
-    """What the search knows of arms or legs."""
+    """What the search knows of arms or legs.
+
+    Attributes:
+        bones: the first two are looked for, the third goes on straight.
+        spheres: their radii at the first one's begin, between them, and at the second one's end.
+        tip: the sphere at the far end of the third bone.
+    """
 
     bones: tuple[str, str, str]
     spheres: tuple[str, str, str]
     tip: str
-    skip: float
-    explained_weight: float
 
 
-ARM = LimbKind(("upper_arm", "forearm", "hand"), ("deltoid", "elbow", "wrist"), "tips", 0.3, 1.5)
-LEG = LimbKind(("thigh", "shin", "foot"), ("thigh_top", "knee", "ankle"), "heel", 0.3, 1.5)
+ARM = LimbKind(("upper_arm", "forearm", "hand"), ("deltoid", "elbow", "wrist"), "tips")
+LEG = LimbKind(("thigh", "shin", "foot"), ("thigh_top", "knee", "ankle"), "heel")
+
+#: A limb's first part lies in the trunk: so much of its first bone is not looked at.
+HIDDEN = 0.3
+#: What running through volume that other parts explain counts beside not fitting into the hull.
+EXPLAINED_WEIGHT = 1.5
 
 #: Parts that a leg does not run through.
 _UPPER_TRUNK = ("belly", "abdomen", "thorax", "chest", "head", "neck")
@@ -248,7 +264,13 @@ TRUNK_PARTS = np.array([p for p, name in enumerate(figure.PART_NAMES) if name in
 
 @dataclass(frozen=True)
 class Limbs:
-    """Candidates for one limb: [M, 7] middle joint, end joint (m, world) and score; the best first."""
+    """Candidates for one limb.
+
+    Attributes:
+        base: [3] its first joint, m, world.
+        lengths: [2] of its bones, m.
+        found: [M, 7] middle joint, end joint (m, world) and score; the best first.
+    """
 
     base: Array
     lengths: Array
@@ -299,6 +321,6 @@ def limb_candidates(
         near = near[:: len(near) // 500 + 1]
     found = limb_kernels.search_limb(
         base, lengths, radii, tip_m, near, sphere_directions(100), hull.sdf, hull.origin_m, hull.voxel_m,
-        explained, STRIDE, kind.skip, 0.04, kind.explained_weight, forbidden, keep,
+        explained, STRIDE, HIDDEN, 0.04, EXPLAINED_WEIGHT, forbidden, keep,
     )  # fmt: skip
     return Limbs(base, lengths, found)

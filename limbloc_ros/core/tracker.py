@@ -85,7 +85,14 @@ class Tracker:
         self._size, self._sized = np.zeros(0), 0
 
     def follow(self, hull: Hull, surface: Surface) -> Fit | None:
-        """Fit the next frame."""
+        """Fit the next frame.
+
+        Args:
+            hull, surface: of one person.
+
+        Returns:
+            the fit, or None when there is no figure yet and no torso fits into the hull.
+        """
         self._frame += 1
         fit: Fit | None = None
         centre = surface.points.mean(axis=0)
