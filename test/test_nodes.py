@@ -219,6 +219,28 @@ def test_a_frozen_camera_is_named_and_its_masks_are_left_out(graph: Graph) -> No
     graph.until(diagnostics.says("segmentation: mask", "segmenting"))
 
 
+def test_in_too_little_light_there_are_no_masks_of_people(graph: Graph) -> None:
+    graph.add(SegmentationNode, camera="cam0", background__learning_frames=LEARNING, reliability="reliable")
+    masks, diagnostics = graph.collect(Image, "cam0/mask"), graph.diagnostics()
+    images = graph.publisher(Image, "cam0/image_raw")
+    room = Room()
+    for n in range(LEARNING):
+        images.publish(pixels_to_image(room.picture(box=False), header(n)))
+        graph.until(lambda n=n: len(masks) == n + 1)
+
+    def send(n: int, box: bool, light: float) -> None:
+        images.publish(pixels_to_image(np.rint(light * room.picture(box)).astype(np.uint8), header(n)))
+
+    send(LEARNING, True, 0.35)
+    graph.until(diagnostics.says("segmentation: mask", "35 %", "no masks"))
+    send(LEARNING + 1, False, 0.35)
+    send(LEARNING + 2, True, 0.45)
+    graph.until(lambda: len(masks) == LEARNING + 2)
+    stamps = [stamp_ns(mask.header) for mask in masks[LEARNING:]]
+    assert stamps == [stamp_ns(header(n)) for n in (LEARNING + 1, LEARNING + 2)]
+    graph.until(diagnostics.says("segmentation: mask", "45 %", "may be missed"))
+
+
 def test_a_covered_and_a_turned_camera_are_named(graph: Graph) -> None:
     graph.add(SegmentationNode, camera="cam0", background__learning_frames=LEARNING, reliability="reliable")
     masks, diagnostics = graph.collect(Image, "cam0/mask"), graph.diagnostics()
