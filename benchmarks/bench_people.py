@@ -82,8 +82,12 @@ class Score:
     def see(self, truth: Sequence[Array | None], found: dict[int, Array]) -> None:
         """One frame: the true joints of everybody, and the joints found by number (reliable ones)."""
         taken: set[int] = set()
-        for k, joints in enumerate(truth):
-            self.present[k] += joints is not None and bool((np.abs(joints[JOINT["torso_centre"], :2]) < INSIDE_M).all())
+        inside = [
+            joints is not None and bool((np.abs(joints[JOINT["torso_centre"], :2]) < INSIDE_M).all())
+            for joints in truth
+        ]
+        for k, there in enumerate(inside):
+            self.present[k] += there
         for number, joints in found.items():
             away = [
                 np.inf
@@ -99,7 +103,7 @@ class Score:
             taken.add(k)
             self.exchanged += self.last.get(k, number) != number
             self.last[k] = number
-            self.reliable[k] += 1
+            self.reliable[k] += inside[k]
             self.errors[k].append(1e3 * float(np.linalg.norm(joints - true, axis=1)[ROWS].mean()))
 
     def text(self) -> str:
