@@ -59,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
         playback.layers = set(args.show)
     if args.picture is not None:
         write_picture(scene, playback, args.picture)
-        print(f"frame {args.frame} in {args.picture}")
+        print(f"{scene.text(args.frame)}\npicture: {args.picture}")
         return 0
     Window(scene, playback, f"limbloc: {args.run}").run()
     return 0
