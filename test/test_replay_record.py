@@ -259,6 +259,18 @@ def test_stepped_replay_expects_no_answer_to_a_single_image(make, context, tmp_p
     assert (replay.steps, replay.unanswered, replay.published) == (2, 0, 5)
 
 
+def test_a_replay_that_expects_results_waits_for_who_makes_them(make, context, tmp_path):
+    """The first start of a smart space compiles kernels for a minute; a short bag would be over by then."""
+    write_bag(tmp_path / "bag")
+    listener = make(Listener, [f"/cam{c}/image_raw" for c in range(2)], Image)
+    replay = make(ReplayNode, bag=str(tmp_path / "bag"), wait_for_results=True, settle_s=0.0, rate=100.0)
+    assert not spin([listener, replay], context, until=replay.done.is_set, timeout_s=1.0)
+    assert replay.published == 0
+    listener.create_publisher(PoseArray, topics.JOINTS, topics.STREAM_QOS)
+    assert spin([listener, replay], context, until=replay.done.is_set, timeout_s=15)
+    assert replay.published > 0
+
+
 def test_masks_are_replayed_when_there_are_no_images(make, context, tmp_path):
     write_bag(tmp_path / "bag", make_message=png, ending="mask/compressed", kind=COMPRESSED)
     listener = make(Listener, ["/cam0/mask/compressed"], CompressedImage)

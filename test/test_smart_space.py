@@ -154,6 +154,7 @@ def test_plan_for_a_bag_of_masks_needs_no_segmentation(tmp_path):
     assert [p.name for p in plans] == ["replay", "carving", "pose"]
     assert plans[1].nodes[0]["parameters"]["mask_transport"] == "raw"
     assert plans[0].nodes[0]["parameters"]["topics"] == ["/cam0/mask", "/cam1/mask", "/cam2/mask"]
+    assert plans[0].nodes[0]["parameters"]["wait_for_results"]  # the first start compiles kernels for a minute
 
 
 @pytest.mark.parametrize(

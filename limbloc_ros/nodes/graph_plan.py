@@ -182,7 +182,8 @@ class _Plan:
                 )
             companions = [f"{self.namespace}/{name}/camera_info" for name in names] + [f"{self.namespace}/true_joints"]
             topics = [re.escape(t) for t in [*(s.topic for s in streams.values()), *companions] if t in bag.topics]
-        section = {"bag": c.bag, "topics": topics, "wait_for_subscribers_s": READY_TIMEOUT_S, **c.replay}
+        patience = {"wait_for_subscribers_s": READY_TIMEOUT_S, "wait_for_results": True}
+        section = {"bag": c.bag, "topics": topics, **patience, **c.replay}
         self.sim_time = bool(section.get("clock", True))
         stepped = section.get("mode") == "stepped"
         self._add("replay", _node("replay", "replay", section), ends_graph=c.stop_with_bag)

@@ -66,6 +66,9 @@ class ReplaySettings:
         low=0.0,
         high=3600.0,
     )
+    wait_for_results: bool = setting(
+        False, "wait as long for somebody to publish `result_topic`, too (stepped mode and a smart space always do)"
+    )
     settle_s: float = setting(
         1.0, "pause between the first subscriber and the first message", unit="s", low=0.0, high=60.0
     )
@@ -224,10 +227,11 @@ class ReplayNode(Node):
         if not self.settings.wait_for_subscribers_s:
             return
         needed = self._pixels or set(self._outputs)
+        results = self.settings.wait_for_results or self.settings.mode == "stepped"
         deadline = time.monotonic() + self.settings.wait_for_subscribers_s
         while not self._stop.is_set():
             waiting = sorted(name for name in needed if not self._outputs[name].get_subscription_count())
-            if self.settings.mode == "stepped" and not self.count_publishers(self.settings.result_topic):
+            if results and not self.count_publishers(self.settings.result_topic):
                 waiting.append(f"{self.settings.result_topic} (nobody publishes it)")
             if not waiting:
                 self._stop.wait(self.settings.settle_s)
