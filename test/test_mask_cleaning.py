@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from limbloc_ros.core import _mask_kernels as kernels
+from limbloc_ros.core import background
 from limbloc_ros.core._background_kernels import CHANGE_SCALE, COLOUR_SCALE
 from limbloc_ros.core.config import BackgroundConfig
 from limbloc_ros.core.mask_cleaning import clean_mask
@@ -180,3 +181,13 @@ class TestCleaning:
         mask = self.mask()
         assert mask[479, 10:50].all()
         assert mask[310:470, 0].all()
+
+
+def test_the_warm_up_leaves_no_kernel_to_be_compiled_for_the_first_person(monkeypatch):
+    """As it was when nothing in its images was foreground: the first person was not seen for ten seconds."""
+    used = set()
+    for name in ("mostly_at_least", "strong_parts", "paint", "add_body_parts", "fill_holes", "erase_blobs"):
+        kernel = getattr(kernels, name)
+        monkeypatch.setattr(kernels, name, lambda *args, n=name, k=kernel: (used.add(n), k(*args))[1])
+    background.warm_up.__wrapped__()
+    assert used == {"mostly_at_least", "strong_parts", "paint", "add_body_parts", "fill_holes", "erase_blobs"}

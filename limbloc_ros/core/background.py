@@ -491,7 +491,10 @@ def warm_up() -> None:
     """Compile or load the kernels, so that the first image is not slow."""
     config = dataclasses.replace(BackgroundConfig(), learning_frames=2, relearn_fraction=1.0)
     model = BackgroundModel(config)
-    image = np.full((32, 32, 3), 100, dtype=np.uint8)
+    image = np.full((64, 64, 3), 100, dtype=np.uint8)
     for _ in range(3):
         model.segment(image)
+    somebody = image.copy()
+    somebody[12:52, 24:40] = 20, 60, 200  # masks are only cleaned where there is something
+    model.segment(somebody)
     estimate_background([image] * 3)
