@@ -56,22 +56,28 @@ SIMPLEST = Effort(
 )  # fmt: skip
 
 
-@functools.lru_cache(maxsize=1)  # the next step goes on from the same figure
-def paper(hull: Hull) -> FigureState | None:
-    """The paper's own chain."""
-    found = engine_paper.fit_state(hull)
-    return None if isinstance(found, NoPerson) else found[0].state
+class Paper:
+    """The paper's own chain. It remembers the last hull's figure, for the next step goes on from the same one."""
 
+    def __init__(self) -> None:
+        self._last: tuple[Hull, FigureState | None] | None = None
 
-def paper_with_least_squares(hull: Hull) -> FigureState | None:
-    """The paper's figure goes on by least squares on our energy."""
-    state = paper(hull)
-    if state is None:
-        return None
-    weights = Weights()
-    evidence = engine_robust.gather_evidence(hull, extract_surface(hull), 1000, np.random.default_rng(0))
-    state = engine_robust.refine(state, evidence, engine_robust.firm(weights), 20).state
-    return engine_robust.refine(state, evidence, weights, 12).state
+    def fit(self, hull: Hull) -> FigureState | None:
+        """The paper's figure."""
+        if self._last is None or self._last[0] is not hull:
+            found = engine_paper.fit_state(hull)
+            self._last = hull, None if isinstance(found, NoPerson) else found[0].state
+        return self._last[1]
+
+    def fit_and_go_on(self, hull: Hull) -> FigureState | None:
+        """The paper's figure, then least squares on our energy."""
+        state = self.fit(hull)
+        if state is None:
+            return None
+        weights = Weights()
+        evidence = engine_robust.gather_evidence(hull, extract_surface(hull), 1000, np.random.default_rng(0))
+        state = engine_robust.refine(state, evidence, engine_robust.firm(weights), 20).state
+        return engine_robust.refine(state, evidence, weights, 12).state
 
 
 def searched(*searches: Effort) -> Callable[[Hull], FigureState | None]:
@@ -96,11 +102,12 @@ class Step:
     hull: HullConfig = VOTING
 
 
+PAPER = Paper()
 _SEVERAL = dataclasses.replace(QUICK, single_arms=0, single_legs=0, rounds=0, enough=0.0)
 STEPS = (
-    Step("`paper`, hull by plain intersection", paper, PLAIN),
-    Step("`paper`, hull by voting", paper),
-    Step("+ least squares on our energy after its simplex", paper_with_least_squares),
+    Step("`paper`, hull by plain intersection", PAPER.fit, PLAIN),
+    Step("`paper`, hull by voting", PAPER.fit),
+    Step("+ least squares on our energy after its simplex", PAPER.fit_and_go_on),
     Step("our search in the place of its anchor points: one torso, one pair of legs, one of arms", searched(SIMPLEST)),
     Step("+ more torsos, pairs of legs and of arms", searched(_SEVERAL)),
     Step("+ each limb of the winner tried elsewhere", searched(dataclasses.replace(QUICK, enough=0.0))),
