@@ -59,6 +59,7 @@ CORE_ORDER = (
     "joint_angles",
     "ros4hri",
     "confidence",
+    "unexplained",
     "pipeline",
     "parts",
     "people",
