@@ -111,6 +111,18 @@ def test_cameras_that_hear_the_same_take_the_same_instants() -> None:
     assert np.diff(taken[0]).min() >= 14
 
 
+def test_a_camera_that_loses_an_image_takes_no_other_in_its_place() -> None:
+    whole, lossy = Thinning(), Thinning()
+    for thinning in (whole, lossy):
+        for second in range(3):
+            thinning.announced(round((10 + 1.01 * second) * 1e9))
+    assert whole.rate_hz == 8.0
+    taken = instants(whole, 14.0, 24.0, 60.0)
+    lost = set(taken[5::3])
+    kept = [n for n in range(840, 1440) if n not in lost and lossy.takes(round(n / 60.0 * 1e9))]
+    assert kept == [n for n in taken if n not in lost]
+
+
 def test_thinning_ends_when_nobody_is_behind_any_more() -> None:
     thinning = Thinning()
     thinning.announced(0)

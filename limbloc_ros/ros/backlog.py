@@ -119,8 +119,9 @@ class Thinning:
 
     Skipping what waits tears the sets when many cameras do it at different moments: each keeps other instants, and a
     set wants all. So all agree on a rate: they hear the same announcements of skipped frames, and each one raises the
-    step, once a second at most; of every interval of the step only the first image is taken. All is counted by stamps,
-    which are the same for all cameras. After a while without announcements the step falls again.
+    step, once a second at most; of every interval of the step only the first image is taken, and none when that one was
+    lost on its way. All is counted by stamps, which are the same for all cameras. After a while without announcements
+    the step falls again.
     """
 
     #: Shortest interval, s; each step doubles it.
@@ -128,11 +129,15 @@ class Thinning:
     STEPS = 6
     #: By stamps: between two steps up, and without announcements before a step down, s.
     UP_S, DOWN_S = 1.0, 20.0
+    #: The camera's period is the shortest between so many last images; the first of an interval comes within it.
+    REMEMBERED = 30
 
     def __init__(self) -> None:
         self._step = 0
         self._stepped_ns = self._heard_ns = 0
         self._interval = -1
+        self._last_ns = 0
+        self._periods_ns: deque[int] = deque(maxlen=self.REMEMBERED)
 
     @property
     def rate_hz(self) -> float:
@@ -147,9 +152,14 @@ class Thinning:
 
     def takes(self, stamp_ns: int) -> bool:
         """Whether an image is to be worked on."""
+        if stamp_ns > self._last_ns:
+            self._periods_ns.append(stamp_ns - self._last_ns)
+        self._last_ns = stamp_ns
         if self._step and abs(stamp_ns - self._heard_ns) > self.DOWN_S * NANOSECONDS:
             self._step, self._heard_ns = self._step - 1, stamp_ns
         if self._step == 0:
             return True
-        before, self._interval = self._interval, int(stamp_ns * self.rate_hz) // NANOSECONDS
-        return self._interval != before
+        rate_hz = self.rate_hz  # a power of two: products with it are exact
+        before, self._interval = self._interval, int(stamp_ns * rate_hz) // NANOSECONDS
+        since_ns = stamp_ns - int(self._interval * NANOSECONDS / rate_hz)
+        return self._interval != before and since_ns < min(self._periods_ns, default=NANOSECONDS)
