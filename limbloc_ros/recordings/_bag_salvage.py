@@ -285,7 +285,7 @@ class SalvagedSqlite:
     def _row(self, columns: str, row: int) -> Any:
         try:
             return self._connection.execute(f"SELECT {columns} FROM messages WHERE id = ?", (row,)).fetchone()
-        except sqlite3.Error as error:
+        except (sqlite3.Error, MemoryError) as error:  # a damaged row may claim to be larger than sqlite can hold
             self.damage = f"{self.path.name}: {error}"
             return None
 
@@ -293,7 +293,7 @@ class SalvagedSqlite:
         """List the readable rows: at once where the database is sound, else one by one."""
         try:
             rows = self._connection.execute("SELECT id, topic_id, timestamp, length(data) FROM messages").fetchall()
-        except sqlite3.Error as error:
+        except (sqlite3.Error, MemoryError) as error:
             self.damage = f"{self.path.name}: {error}"
             rows, row, misses = [], 0, 0
             # A row takes some bytes: no file has more rows than that.

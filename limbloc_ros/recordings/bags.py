@@ -407,7 +407,9 @@ class _Healthy:
         wanted = [c for c in self._reader.connections if c.topic in names]
         if wanted:
             for connection, stamp_ns, cdr in self._reader.messages(wanted, start=start_ns, stop=stop_ns):
-                yield connection.topic, stamp_ns, cdr
+                # sqlite may hold anything in the place of a message
+                lost = cdr is None or isinstance(cdr, (str, int, float))
+                yield connection.topic, stamp_ns, b"" if lost else cdr
 
     def close(self) -> None:
         """Close the files."""
