@@ -47,7 +47,6 @@ class Part:
         centres = (local + np.asarray(hull.index_min) + 0.5) * hull.voxel_m
         return Part(centres[:: max(1, len(local) // POINTS)], centres.mean(axis=0), len(local) * hull.voxel_m**3)
 
-
     def filling(self) -> Flesh:
         """It as balls, one around each of the points."""
         radius = (self.volume_m3 / len(self.points)) ** (1 / 3)
