@@ -18,6 +18,7 @@ from fuzz.inputs import npy_with_shape, packed_npz
 from fuzz.targets import CORPUS, TARGETS, check
 from limbloc_ros.core.config import BackgroundConfig, FitConfig, HullConfig, SyncConfig, from_mapping
 from limbloc_ros.core.errors import ConfigError, InputError, RigError
+from limbloc_ros.recordings._bag_salvage import SalvagedSqlite
 from limbloc_ros.recordings.npz_file import MOST_BYTES, read_npz
 from limbloc_ros.rig.plain_values import json_values, yaml_values
 from limbloc_ros.rig.rig_file import rig_from_mapping
@@ -158,6 +159,15 @@ def test_an_archive_whose_directory_claims_more_than_the_file_takes_no_memory():
         """, CORPUS / "background" / "MemoryError_84ef17",
     )  # fmt: skip
     assert "its directory claims" in said
+
+
+def test_a_database_that_claims_more_than_sqlite_can_hold_is_refused(tmp_path, monkeypatch):
+    def connect(_):
+        raise MemoryError  # as sqlite3 does when a damaged list of tables claims to be that large
+
+    monkeypatch.setattr(SalvagedSqlite, "_connect", connect)
+    with pytest.raises(InputError, match="its list of topics cannot be read"):
+        SalvagedSqlite(tmp_path / "bag.db3")
 
 
 def test_a_bag_whose_record_claims_a_gigabyte_takes_no_memory():

@@ -227,7 +227,7 @@ class SalvagedSqlite:
                     self._contents.topics[key] = SalvagedTopic(
                         name, kind, profiles if isinstance(profiles, str) else ""
                     )
-        except (sqlite3.Error, UnicodeDecodeError) as error:
+        except (sqlite3.Error, UnicodeDecodeError, MemoryError) as error:
             raise InputError(
                 f"{path}: expected a rosbag2 sqlite3 database, but its list of topics cannot be read ({error}). "
                 "Record with storage mcap: it survives being cut"
