@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from limbloc_ros import __version__
+from limbloc_ros.core.errors import InputError
 from limbloc_ros.core.figure import N_SPHERES, PART_NAMES, PART_SPHERES, place, proportions
 from limbloc_ros.core.flesh_mesh import icosphere, support_points
 from limbloc_ros.export.skeleton import Y_UP, Skeleton, rest_state
@@ -158,7 +159,10 @@ def _ends(skeleton: Skeleton) -> set[int]:
 
 def _quaternions(rotations: Array) -> Array:
     """[F, 4] x y z w; neighbours on the same half of the sphere, so that players interpolate the short way."""
-    found = Rotation.from_matrix(np.array(rotations)).as_quat()
+    try:
+        found = Rotation.from_matrix(np.array(rotations)).as_quat()
+    except ValueError as error:
+        raise InputError(f"a bone's rotation is none ({error}): the run's file is damaged; run `process` again") from None
     flips = np.where(np.sum(found[1:] * found[:-1], axis=1) < 0, -1.0, 1.0)
     found[1:] *= np.cumprod(flips)[:, None]
     return np.asarray(found)
