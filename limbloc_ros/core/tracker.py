@@ -55,9 +55,8 @@ class Tracker:
         ),
     )  # fmt: skip
     #: Limbs are checked at once when the cost is so much above the usual one (in vain, the wait doubles); other places
-    #: that are tried for each; how much higher the energy may be at first (no limb that was right began higher), and
-    #: how much lower it must be in the end.
-    LIMB_DOUBT, ARM_PLACES, LEG_PLACES, PROMISING, BETTER = 1.25, 1, 1, 1.1, 0.97
+    #: that are tried for each; how much lower the energy must be there.
+    LIMB_DOUBT, ARM_PLACES, LEG_PLACES, BETTER = 1.25, 1, 1, 0.97
     #: The figure is carried along with the firm weights of the search, which lead from further off; so many more steps
     #: with the final ones put its joints in their places.
     FINAL_STEPS = 6
@@ -167,8 +166,6 @@ class Tracker:
             for side in "LR":
                 for state in with_one_limb(result.state, scene, kind, side, places, QUICK.candidates):
                     settled = refine(state, scene.quick, scene.lenient, 5, size).state
-                    if energy.system(settled, evidence, self._firm).cost > self.PROMISING * result.system.cost:
-                        continue
                     other = refine(settled, evidence, self._firm, 8, size)
                     if other.system.cost < self.BETTER * result.system.cost:
                         result = other
