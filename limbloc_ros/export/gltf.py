@@ -162,7 +162,7 @@ def _quaternions(rotations: Array) -> Array:
     try:
         found = Rotation.from_matrix(np.array(rotations)).as_quat()
     except ValueError as error:
-        raise InputError(f"a bone's rotation is none ({error}): the run's file is damaged; run `process` again") from None
+        raise InputError(f"a bone's rotation is none ({error}): the file is damaged; run `process` again") from None
     flips = np.where(np.sum(found[1:] * found[:-1], axis=1) < 0, -1.0, 1.0)
     found[1:] *= np.cumprod(flips)[:, None]
     return np.asarray(found)
