@@ -152,7 +152,7 @@ def transform(position: Array, quaternion: Array, at: str) -> Array:
         RigError: the quaternion's length is not 1.
     """
     length = float(np.linalg.norm(quaternion))
-    if abs(length - 1) > 1e-3:
+    if not abs(length - 1) <= 1e-3:  # also when it is no number
         raise RigError(f"{at}: expected a quaternion x y z w of length 1, got {quaternion.tolist()}")
     T = np.eye(4)
     T[:3, :3] = Rotation.from_quat(quaternion / length).as_matrix()
