@@ -47,6 +47,8 @@ ROWS = [JOINT[name] for name in SCORED]
 NEAR_M = 0.3
 #: Who is further than this from the middle is not wholly in the carve volume.
 INSIDE_M = 1.25
+#: A live graph in which nobody is found after so long is scored all the same, s.
+LONGEST_WAIT_S = 120.0
 
 #: Name, people, what they do, whether a chair is put beside them and moved.
 SCENES = (
@@ -202,16 +204,16 @@ def score_live(people: int, together: str, args: argparse.Namespace) -> tuple[Sc
             hear_body(number)
         node.create_subscription(PoseArray, topics.JOINTS, answered, topics.WORK_QOS)
         with Supervisor(plans, environment, config.processes, lambda line: None) as graph:
-            end = None
+            began, end = time.monotonic(), None
             while end is None or time.monotonic() < end:
                 graph.poll()
                 executor.spin_once(timeout_sec=0.05)
-                if end is None and found:
+                if end is None and (found or time.monotonic() - began > LONGEST_WAIT_S):
                     end = time.monotonic() + args.live
         node.destroy_node()
         rclpy.try_shutdown()
     score = Score(people)
-    begin = min(found)
+    begin = min(found or first)
     for stamp in sorted(set(first) & set(truth)):
         if stamp >= begin:
             score.see([truth[stamp].get(k) for k in range(people)], found.get(stamp, {}))
