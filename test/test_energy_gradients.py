@@ -135,7 +135,7 @@ def test_matrix_of_the_surface_term_against_its_residuals(case, seen, along):
     def residuals(step):
         return ray_distances(evidence.points, evidence.rays, place(state.moved(step)))
 
-    h = 1e-6
+    h = 1e-5  # smaller steps drown in the distances' rounding, larger ones bend
     J = np.stack([(residuals(h * e) - residuals(-h * e)) / (2 * h) for e in np.eye(size(state))], axis=1)
     d = residuals(np.zeros(size(state)))
     weight = evidence.point_weights * np.where(d < 0, 3.0, 1.0)
@@ -143,7 +143,7 @@ def test_matrix_of_the_surface_term_against_its_residuals(case, seen, along):
     assert (d < 0).any()
     assert system.cost == pytest.approx((weight * d * d).sum(), rel=1e-6)
     matrix = J.T @ (weight[:, None] * J)
-    np.testing.assert_allclose(system.matrix, matrix, atol=1e-6 * np.abs(matrix).max())
+    np.testing.assert_allclose(system.matrix, matrix, atol=3e-6 * np.abs(matrix).max())
     np.testing.assert_allclose(system.gradient, J.T @ (weight * d), atol=1e-6 * np.abs(J.T @ (weight * d)).max())
 
 
