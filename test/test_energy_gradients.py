@@ -143,8 +143,10 @@ def test_matrix_of_the_surface_term_against_its_residuals(case, seen, along):
     assert (d < 0).any()
     assert system.cost == pytest.approx((weight * d * d).sum(), rel=1e-6)
     matrix = J.T @ (weight[:, None] * J)
-    np.testing.assert_allclose(system.matrix, matrix, atol=3e-6 * np.abs(matrix).max())
-    np.testing.assert_allclose(system.gradient, J.T @ (weight * d), atol=1e-6 * np.abs(J.T @ (weight * d)).max())
+    # (along rays triangles become slivers, whose distances are good to some nanometres only)
+    close = 2e-6 if along == "points" else 2e-5
+    np.testing.assert_allclose(system.matrix, matrix, atol=close * np.abs(matrix).max())
+    np.testing.assert_allclose(system.gradient, J.T @ (weight * d), atol=close * np.abs(J.T @ (weight * d)).max())
 
 
 def test_blocks_are_gathered_as_a_dense_product():
