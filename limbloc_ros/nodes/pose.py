@@ -59,7 +59,7 @@ class PoseSettings:
         5.0, "but not more often than this, so that viewers need not reload", unit="s", low=0.0, high=3600.0, live=True
     )
     catch_up_s: float = setting(
-        1.0,
+        2.0,
         "hulls may wait this long, by their stamps, while a figure is searched; then only the newest is fitted",
         unit="s",
         low=0.0,
