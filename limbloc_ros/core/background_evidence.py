@@ -77,4 +77,5 @@ def measure_evidence(
     else:
         rim = max(LOOKED_ROWS, round(RIM_PX * np.sqrt(change.size / REFERENCE_PIXELS)))
         foreground_spans(change, levels[0], colour, levels[1], first, LOOKED_ROWS, rim, spans)
+    spans[first::LOOKED_ROWS] = 0  # these are measured already
     measure(planes, *background, spans, change, colour)
