@@ -5,6 +5,8 @@ import os
 import signal
 from pathlib import Path
 
+import pytest
+
 # One thread each, as the nodes of the graph have it (ros/environment.py): test processes run side by side, and BLAS's
 # threads would wait for each other. Before numpy is imported; processes that tests start inherit it.
 for library in ("OMP", "OPENBLAS"):
@@ -30,3 +32,13 @@ def pytest_collection_modifyitems(items):
             marks[item.path] = "room" if room else "live" if any(word in text for word in _LIVE) else None
         if marks[item.path]:
             item.add_marker(marks[item.path])
+
+
+@pytest.fixture
+def graph():
+    """A ROS context with a tester node of its own; closed after the test."""
+    from ros_graph import Graph  # only where nodes are started: what calculates needs no ROS
+
+    graph = Graph()
+    yield graph
+    graph.close()

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -16,13 +15,6 @@ from limbloc_ros.ros.backlog import Backlog, Thinning
 from limbloc_ros.ros.messages import make_header, stamp_ns
 
 FRAME_NS = 100_000_000
-
-
-@pytest.fixture
-def graph() -> Iterator[Graph]:
-    graph = Graph()
-    yield graph
-    graph.close()
 
 
 def test_items_are_worked_off_in_order_and_not_inside_of_add(graph: Graph) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import time
 from array import array
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -35,13 +34,6 @@ T0_NS = 1_000_000_000_000
 FRAME_NS = 100_000_000
 
 Masks = dict[str, np.ndarray]
-
-
-@pytest.fixture
-def graph() -> Iterator[Graph]:
-    graph = Graph()
-    yield graph
-    graph.close()
 
 
 @pytest.fixture(scope="module")

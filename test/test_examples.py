@@ -10,20 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from geometry_msgs.msg import PoseArray, Twist
-from ros_graph import DOMAIN, Graph
+from ros_graph import DOMAIN
 
 from limbloc_ros.core.pose import JOINT, JOINT_NAMES
 from limbloc_ros.ros import topics
 from limbloc_ros.ros.messages import joints_to_message, make_header
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "slow_down_near_hand.py"
-
-
-@pytest.fixture
-def graph():
-    graph = Graph()
-    yield graph
-    graph.close()
 
 
 def test_the_robot_slows_down_near_a_hand(graph):

@@ -12,7 +12,6 @@ from pathlib import Path
 import pytest
 from geometry_msgs.msg import PoseArray
 from rclpy.serialization import deserialize_message
-from ros_graph import Graph
 from std_msgs.msg import String
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
@@ -27,13 +26,6 @@ from limbloc_ros.recordings.bags import TYPESTORE
 from limbloc_ros.ros import topics
 
 ROOT = Path(__file__).parents[1]
-
-
-@pytest.fixture
-def graph():
-    graph = Graph()
-    yield graph
-    graph.close()
 
 
 class Viewer:

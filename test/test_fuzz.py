@@ -132,32 +132,26 @@ def limited(script: str, *arguments: object) -> str:
     return done.stdout
 
 
+READ_ARCHIVE = """
+try:
+    npz_file.read_npz(Path(sys.argv[1]))
+except LimblocError as error:
+    print(error)
+"""
+
+
 def test_an_archive_that_claims_a_billion_numbers_takes_no_memory(tmp_path):
     path = tmp_path / "lie.npz"
     with zipfile.ZipFile(path, "w") as archive:
         np.save(tmp_path / "a.npy", np.zeros(4))
         raw = (tmp_path / "a.npy").read_bytes()
         archive.writestr("a.npy", npy_with_shape(raw, "(1000000000,)"))
-    said = limited(
-        """
-        try:
-            npz_file.read_npz(Path(sys.argv[1]))
-        except LimblocError as error:
-            print(error)
-        """, path,
-    )  # fmt: skip
+    said = limited(READ_ARCHIVE, path)
     assert "its header claims [1000000000] float64, but 32 bytes are there" in said
 
 
 def test_an_archive_whose_directory_claims_more_than_the_file_takes_no_memory():
-    said = limited(
-        """
-        try:
-            npz_file.read_npz(Path(sys.argv[1]))
-        except LimblocError as error:
-            print(error)
-        """, CORPUS / "background" / "MemoryError_84ef17",
-    )  # fmt: skip
+    said = limited(READ_ARCHIVE, CORPUS / "background" / "MemoryError_84ef17")
     assert "its directory claims" in said
 
 

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -15,13 +14,6 @@ from ros_graph import Graph
 from limbloc_ros.core.errors import InputError
 from limbloc_ros.ros import health
 from limbloc_ros.ros.messages import ERROR, OK, make_status
-
-
-@pytest.fixture
-def graph() -> Iterator[Graph]:
-    graph = Graph()
-    yield graph
-    graph.close()
 
 
 def test_meter_counts_the_last_seconds_only() -> None:

@@ -8,7 +8,6 @@ the tool that users have for it.
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
@@ -64,13 +63,6 @@ def recorded(tool: ModuleType, rig: Rig, tmp_path_factory: pytest.TempPathFactor
     save_rig(rig, folder / "rig.yaml")
     assert tool.write_bag(WALK / "rgb", rig, folder / "bag", numbers=range(FRAMES)) == FRAMES * len(CAMERAS)
     return folder / "bag", folder / "rig.yaml"
-
-
-@pytest.fixture
-def graph() -> Iterator[Graph]:
-    graph = Graph()
-    yield graph
-    graph.close()
 
 
 def offline_run(path: Path, rig: Rig, *, temporal: bool = False) -> Run:

@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
 
 import pytest
 from geometry_msgs.msg import PoseArray
@@ -15,13 +14,6 @@ from ros_graph import DOMAIN, Graph
 
 from limbloc_ros.ros import topics
 from limbloc_ros.ros.node_main import REFUSED
-
-
-@pytest.fixture
-def graph() -> Iterator[Graph]:
-    graph = Graph()
-    yield graph
-    graph.close()
 
 
 def start(*parameters: str) -> subprocess.Popen[str]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import time
 from array import array
-from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -36,13 +35,6 @@ from limbloc_ros.simulation.room import SimulatedRoom, default_rig
 
 LEARNING = 4
 FRAME_NS = 33_333_333
-
-
-@pytest.fixture
-def graph() -> Iterator[Graph]:
-    graph = Graph()
-    yield graph
-    graph.close()
 
 
 class Room:

@@ -7,7 +7,6 @@ import dataclasses
 import types
 import xml.etree.ElementTree as ET
 from array import array
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -53,13 +52,6 @@ T0_NS = 1_000_000_000_000
 FRAME_NS = 100_000_000
 #: The person has come in by then.
 T_S = 2.0
-
-
-@pytest.fixture
-def graph() -> Iterator[Graph]:
-    graph = Graph()
-    yield graph
-    graph.close()
 
 
 @pytest.fixture(scope="module")

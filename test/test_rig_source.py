@@ -55,13 +55,6 @@ def message(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
             del sys.modules[name]
 
 
-@pytest.fixture
-def graph() -> Iterator[Graph]:
-    graph = Graph()
-    yield graph
-    graph.close()
-
-
 @pytest.fixture(scope="module")
 def rig() -> Rig:
     return default_rig(4, 160, 120)

@@ -15,7 +15,6 @@ from pathlib import Path
 
 import pytest
 from rclpy.parameter import Parameter
-from ros_graph import Graph
 
 from limbloc_ros import cli
 from limbloc_ros.nodes.composed import KINDS, flatten
@@ -44,13 +43,6 @@ def sources():
     """Every module of ours, parsed."""
     paths = [path for folder in FOLDERS for path in sorted((ROOT / folder).rglob("*.py"))]
     return {str(path.relative_to(ROOT)): ast.parse(path.read_text()) for path in paths}
-
-
-@pytest.fixture
-def graph():
-    graph = Graph()
-    yield graph
-    graph.close()
 
 
 def allowed(text):
