@@ -8,9 +8,9 @@ import importlib
 import signal
 import sys
 from collections.abc import Sequence
-from types import FrameType
 
 from limbloc_ros import __version__
+from limbloc_ros.core import interrupts
 from limbloc_ros.core.errors import Interrupted, LimblocError
 
 #: Subcommand -> one line about it. Modules are imported when called, so that `process` needs no ROS.
@@ -58,8 +58,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return EXIT_INPUT
     module = importlib.import_module(f"limbloc_ros.commands.{args.command}")
     # `kill` and a closing terminal end like Ctrl-C: files are finished, children stopped.
-    for number in (signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, _interrupt)
+    interrupts.install((signal.SIGINT, signal.SIGTERM, signal.SIGHUP))
     try:
         return int(module.run(args))
     except LimblocError as error:
@@ -114,7 +113,3 @@ def _joined(arguments: list[str]) -> list[str]:
         else:
             joined.append(word)
     return joined
-
-
-def _interrupt(_number: int, _frame: FrameType | None) -> None:
-    raise KeyboardInterrupt

@@ -26,6 +26,7 @@ ALLOWED = {
 #: Modules of the core, as the data flows; each may import only what stands before it.
 CORE_ORDER = (
     "errors",
+    "interrupts",
     "config",
     "camera",
     "lens",

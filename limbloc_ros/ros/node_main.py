@@ -6,6 +6,7 @@ from __future__ import annotations
 import signal
 import time
 from collections.abc import Callable, Sequence
+from types import FrameType
 
 import cv2
 import rclpy
@@ -16,6 +17,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from limbloc_ros.core.errors import LimblocError
+from limbloc_ros.core.interrupts import interrupt
 
 #: Exit code when a node refused its parameters or input: starting again would not help.
 REFUSED = 2
@@ -99,11 +101,11 @@ def main(
     nodes: Sequence[Node] = ()
     spinning = stopped = False
 
-    def on_signal(*_: object) -> None:
+    def on_signal(number: int, frame: FrameType | None) -> None:
         nonlocal stopped
         stopped = True
         if not spinning:  # a start that compiles kernels takes a while; nobody wants to wait for its end
-            raise KeyboardInterrupt
+            interrupt(number, frame)
 
     # rclpy's own handlers invalidate the context at once, and a callback that is just publishing then fails.
     rclpy.init(args=None if args is None else list(args), signal_handler_options=SignalHandlerOptions.NO)

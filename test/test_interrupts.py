@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Ctrl-C at the worst of times: while LLVM asks Python for a cached kernel."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+
+import pytest
+
+from limbloc_ros.core import interrupts
+
+# Every look-up of a cached kernel is met by a signal; llvmlite looks them up in a callback that LLVM calls.
+LOADING = """
+import signal
+from llvmlite.binding.executionengine import ExecutionEngine
+from limbloc_ros.core import interrupts
+from limbloc_ros.core.background import warm_up
+
+look_up, met = ExecutionEngine._find_module_ptr, []
+
+def interrupted_look_up(self, address):
+    if not met:
+        met.append(address)
+        signal.raise_signal(signal.{name})
+    return look_up(self, address)
+
+ExecutionEngine._find_module_ptr = interrupted_look_up
+interrupts.install((signal.{name},))
+try:
+    warm_up()
+    print("loaded, never interrupted")
+except KeyboardInterrupt:
+    print("interrupted", len(met))
+"""
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
+def test_a_signal_while_a_kernel_is_loaded_waits_for_its_end(name):
+    done = subprocess.run(
+        [sys.executable, "-c", LOADING.format(name=name)], capture_output=True, text=True, timeout=300, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == "interrupted 1\n"
+    assert done.stderr == ""
+
+
+def test_elsewhere_a_signal_interrupts_at_once():
+    before = signal.getsignal(signal.SIGUSR1)
+    try:
+        interrupts.install((signal.SIGUSR1,))
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGUSR1)
+    finally:
+        signal.signal(signal.SIGUSR1, before)
