@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The live graph: poses a second, latency, lost frames, CPU and memory of every process.
 
-    python benchmarks/bench_live.py [--seconds 30] [--rate 20] [--cameras 8] [--record FOLDER] [--set KEY=VALUE ...]
+    python benchmarks/bench_live.py [--seconds 30] [--rate 20] [--number 8] [--record FOLDER] [--set KEY=VALUE ...]
 
 Starts the whole graph on simulated cameras over DDS, as `limbloc demo` does, and measures `--seconds` from the first
 pose on. Frames are counted by their stamps: those the simulated cameras filmed, and those `joints` came for. Latency is

@@ -15,6 +15,8 @@ TEXTS = [*PAGES, ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
 PROGRAMS = ("limbloc ", "python -m limbloc_ros ")
 #: Commands whose help has examples.
 HELPS = [*cli.COMMANDS, *(f"rig {action}" for action in ("import", "export", "calibrate", "check", "plan"))]
+#: Commands that start nodes.
+NODES = ("demo", "run", "record", "replay")
 
 
 def code_lines(text):
@@ -52,6 +54,12 @@ def examples(words):
     """The command lines below `examples:` of a help."""
     lines = help_of(words).partition("examples:")[2].splitlines()
     return list(commands("\n".join(f"    {line}" for line in lines)))
+
+
+def commands_by_page():
+    """Page, or help, -> its command lines."""
+    pages = {path.name: list(commands(path.read_text(encoding="utf-8"))) for path in TEXTS}
+    return pages | {f"limbloc {words} --help": examples(words) for words in HELPS}
 
 
 def parse(command):

@@ -2,6 +2,8 @@
 """Many recordings: on a real Dask cluster of processes the same files as here, also when a worker is killed."""
 
 import os
+import re
+import shlex
 import shutil
 import signal
 import threading
@@ -11,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from distributed import Client, LocalCluster
+from documented import commands_by_page
 
 from limbloc_ros import cli
 from limbloc_ros.core.config import FitConfig
@@ -67,6 +70,17 @@ def kill_the_first_that_works(address, killed):
         killed.append(pids[busy[0]])
 
 
+def run_documented_commands(recordings, out, address):
+    """Those for a cluster, on one recording and this cluster in place of theirs."""
+    found = {c for page in commands_by_page().values() for c in page if c.startswith("batch ") and "--dask" in c}
+    assert found
+    ours = {"bags/*": recordings / "short", "rig.yaml": recordings / "short" / "calib.json", "out/study": out}
+    for command in sorted(found):
+        words = [str(ours.get(word, word)) for word in shlex.split(command)]
+        assert cli.main([re.sub(r"^tcp://.*", address, word) for word in words]) == 0
+        assert len(Run.load(out / "short")) == 1
+
+
 @pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
 def test_a_cluster_gives_the_same_files_also_when_a_worker_is_killed(recordings, here, tmp_path):
     killed = []
@@ -81,6 +95,7 @@ def test_a_cluster_gives_the_same_files_also_when_a_worker_is_killed(recordings,
         assert not any(o.error or o.done_before for o in outcomes.values())
         again = list(do_on_cluster(tasks_into(recordings, tmp_path)[:2], address))
         assert all(o.done_before and not o.error for o in again)
+        run_documented_commands(recordings, tmp_path / "documented", address)
     for name in ("long", "short"):
         for file in ("joints.npz", "joint_angles.csv", "rig.yaml"):
             assert (tmp_path / name / file).read_bytes() == (here / name / file).read_bytes()

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the documentation says can be done: its commands parse, its links lead somewhere, its site has every page."""
+"""What the documentation says can be done: its commands parse, its links lead somewhere, its site has every page.
+
+`limbloc` commands are run, too: test_documented_commands.py, test_documented_nodes.py.
+"""
 
 import re
 import shlex
@@ -10,6 +13,7 @@ import yaml
 from documented import HELPS, PAGES, ROOT, TEXTS, code_lines, commands, examples, parse
 
 from limbloc_ros import cli
+from limbloc_ros.nodes import smart_space
 
 
 def name_of(path):
@@ -49,6 +53,29 @@ def ros2_commands():
         for line in [*code_lines(text), *spans]:
             if line.startswith(("ros2 ", "rviz2 ")):
                 yield name_of(path), line.partition("  #")[0].strip()
+
+
+#: Programs in the documentation's code. Ours are run or, where that takes minutes or a network, checked here; what
+#: installs ROS 2 or sets up a shell is other people's.
+PROGRAMS_RUN = {"limbloc", "python", "make", "ros2", "rviz2", ".ci/run"}
+PROGRAMS_OF_OTHERS = {"mkdir", "git", "rosdep", "pip", "colcon", "export", "pre-commit"}
+
+
+@pytest.mark.parametrize("path", TEXTS, ids=name_of)
+def test_every_command_is_accounted_for(path):
+    text = re.sub(r"```\w+\n.*?```", "", path.read_text(encoding="utf-8"), flags=re.S)  # Python, YAML
+    for line in code_lines(text):
+        program = re.match(r"(\.?[a-z][\w./-]*) (?! )", line)
+        if program and "/" not in program[1].removeprefix(".ci/"):  # not a file, in a list of what there is
+            assert program[1] in PROGRAMS_RUN | PROGRAMS_OF_OTHERS, line
+    for line in [*code_lines(text), *re.findall(r"`(python [^`]+)`", " ".join(text.split()))]:
+        words = line.partition("  #")[0].split()
+        if words[:1] == ["python"] and words[1] != "-m":
+            script = (ROOT / words[1]).read_text(encoding="utf-8")
+            if "smart_space import" in script:  # it has the smart space's options, too
+                script += Path(smart_space.__file__).read_text(encoding="utf-8")
+            for option in words[2:]:
+                assert not option.startswith("--") or f'"{option}"' in script, line
 
 
 def executables():

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Every command line of ours in the documentation and the helps is run, page by page, on small recordings.
 
-Two frames stand for a recording, and the pictures of reports are put together but not drawn (test_report.py draws
-them). A command that was run on another page with the same options and the same kind of input is not run again.
-Commands that start nodes (`demo`, `run`, `record`, `replay`) and `view`, which opens a window, are only parsed, in
-test_docs.py; they have tests of their own. `rig calibrate` is run on pictures of a board in test_rig_calibrate.py.
+Two frames stand for a recording, and the pictures of reports and of `view` are put together but not drawn
+(test_report.py and test_viewer.py do). A command that was run on another page with the same options and the same kind
+of input is not run again. Elsewhere are run: what starts nodes, in test_documented_nodes.py; `rig calibrate`, on
+pictures of a board, in test_rig_calibrate.py; `batch --dask`, on a cluster, in test_batch.py.
 """
 
 import re
@@ -12,13 +12,14 @@ import shlex
 import shutil
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from documented import HELPS, ROOT, TEXTS, commands, examples
+from documented import HELPS, NODES, ROOT, commands_by_page
 
 from limbloc_ros import cli
-from limbloc_ros.commands import rig_plan
+from limbloc_ros.commands import rig_plan, view
 from limbloc_ros.recordings import offline
 from limbloc_ros.recordings.cases import load_case
 from limbloc_ros.recordings.results import Run
@@ -37,9 +38,7 @@ BALANCE_SIZES = Wishes(
 #: Images of WALK with the man that are taken, and what stands for `--leave-out` of all before the last of them.
 PERSON, LEAVE_OUT = (8, 10), "15"
 
-NODES = ("demo", "run", "record", "replay", "view")
-PAGES = {path.name: list(commands(path.read_text(encoding="utf-8"))) for path in TEXTS}
-PAGES |= {f"limbloc {words} --help": examples(words) for words in HELPS}
+PAGES = commands_by_page()
 #: Pages about the balance; on all others `rig.yaml`, `videos/` and bags are the walk's.
 OF_BALANCE = ("tutorial.md", "own_cameras.md", "limbloc rig --help", "limbloc rig import --help")
 #: Options and kind of input of what was run already, in this process.
@@ -180,6 +179,13 @@ def undrawn(monkeypatch):
     monkeypatch.setattr(pictures, "render", lambda *_, **__: blank)
     monkeypatch.setattr(sections, "figure_png", lambda figure: sections.image_png(blank))
 
+    def shown(scene, playback, _):
+        assert scene.shapes(playback.number, playback.layers, playback.colour)
+        return SimpleNamespace(run=lambda: None)
+
+    for name, stub in (("Window", shown), ("write_picture", shown), ("load_open3d", int), ("require_display", int)):
+        monkeypatch.setattr(view, name, stub)
+
 
 @pytest.mark.parametrize("page", [page for page, lines in PAGES.items() if lines])
 def test_the_commands_of_a_page_run(page, masters, tmp_path, monkeypatch, capsys):
@@ -199,6 +205,8 @@ def test_the_commands_of_a_page_run(page, masters, tmp_path, monkeypatch, capsys
             words[words.index("--leave-out") + 1] = LEAVE_OUT
         if "--last" in words:  # of the two frames of the run
             words[words.index("--first") + 1], words[words.index("--last") + 1] = "0", "1"
+        if "--frame" in words:
+            words[words.index("--frame") + 1] = "1"
         code = cli.main(words)
         assert code == 0, f"limbloc {command}: {capsys.readouterr().err}"
 
@@ -207,9 +215,7 @@ def test_all_that_runs_without_nodes_was_run():
     """Also a check that the page tests above did not skip what they should not."""
     every = [shlex.split(command) for lines in PAGES.values() for command in lines]
     ran = {shape[0] for shape in DONE}
-    assert ran == {"process", "batch", "report", "export", "security", *(w for w in HELPS if w.startswith("rig "))} - {
-        "rig calibrate"
-    }
+    assert ran == {words for words in HELPS if words not in (*NODES, "rig", "rig calibrate")}
     assert len(every) > 100
     assert len(DONE) > 35
 
