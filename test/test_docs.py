@@ -4,6 +4,7 @@
 `limbloc` commands are run, too: test_documented_commands.py, test_documented_nodes.py.
 """
 
+import ast
 import re
 import shlex
 from pathlib import Path
@@ -69,13 +70,25 @@ def test_every_command_is_accounted_for(path):
         if program and "/" not in program[1].removeprefix(".ci/"):  # not a file, in a list of what there is
             assert program[1] in PROGRAMS_RUN | PROGRAMS_OF_OTHERS, line
     for line in [*code_lines(text), *re.findall(r"`(python [^`]+)`", " ".join(text.split()))]:
-        words = line.partition("  #")[0].split()
-        if words[:1] == ["python"] and words[1] != "-m":
-            script = (ROOT / words[1]).read_text(encoding="utf-8")
-            if "smart_space import" in script:  # it has the smart space's options, too
-                script += Path(smart_space.__file__).read_text(encoding="utf-8")
-            for option in words[2:]:
-                assert not option.startswith("--") or f'"{option}"' in script, line
+        assert not unknown_options(line.partition("  #")[0]), line
+
+
+@pytest.mark.parametrize("folder", ["benchmarks", "tools"])
+def test_what_scripts_say_of_themselves_can_be_given(folder):
+    for path in (ROOT / folder).glob("*.py"):
+        for line in (ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or "").splitlines():
+            assert not unknown_options(line.strip().removeprefix("sudo ")), f"{path.name}: {line}"
+
+
+def unknown_options(line):
+    """Options in `python SCRIPT ...` that the script does not have."""
+    words = [word.strip("[]") for word in line.split()]
+    if words[:1] != ["python"] or "/" not in words[1] or not words[1].endswith(".py"):
+        return []
+    script = (ROOT / words[1]).read_text(encoding="utf-8")
+    if "smart_space import" in script:  # it has the smart space's options, too
+        script += Path(smart_space.__file__).read_text(encoding="utf-8")
+    return [word for word in words[2:] if word.startswith("--") and f'"{word}"' not in script]
 
 
 def executables():

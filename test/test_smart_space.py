@@ -19,6 +19,7 @@ from rclpy.serialization import serialize_message
 from sensor_msgs.msg import CompressedImage, Image
 from std_msgs.msg import Header
 
+from limbloc_ros import cli
 from limbloc_ros.core.errors import ConfigError, InputError, RigError
 from limbloc_ros.nodes import composed, process_server, smart_space
 from limbloc_ros.nodes.graph_plan import SmartSpaceConfig, load_config, plan_graph
@@ -201,9 +202,26 @@ def test_options_come_on_top_of_the_file(tmp_path):
         smart_space.config_from_arguments(parser.parse_args(["--set", "engine"]))
 
 
-def test_the_command_line_prints_errors_without_a_trace(capsys, tmp_path):
-    assert smart_space.main(["--source", "cameras", "--rig", str(tmp_path / "no.yaml")]) == 1
-    assert "no.yaml" in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("--source cameras --rig no.yaml", "no.yaml"),
+        ("no.yaml", "no.yaml: expected a smart space file"),
+        ("--set engine", "expected KEY=VALUE"),
+        ("--set foxglove_bridge=5 --foxglove 9000", "foxglove_bridge.port lies inside of foxglove_bridge, which --set"),
+        ("--set foxglove_bridge= --foxglove 9000", "foxglove_bridge.port lies inside of foxglove_bridge, which --set"),
+        ("--set pose.fit=3 --set pose.fit.engine=paper", "pose.fit.engine lies inside of fit, which --set made 3"),
+        ("--set segmentation_of.cam0=5", "segmentation_of: cam0: expected a section of parameters, got 5"),
+    ],
+)
+def test_wrong_input_is_one_line_and_exit_code_2(arguments, message, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for program, main in (("limbloc run", lambda a: cli.main(["run", *a])), ("smart_space", smart_space.main)):
+        assert main(arguments.split()) == 2
+        error = capsys.readouterr().err
+        assert message in error
+        assert error.startswith(f"{program}: ")
+        assert error.count("\n") == 1
 
 
 IMPATIENT = """

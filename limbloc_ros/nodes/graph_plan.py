@@ -210,6 +210,9 @@ class _Plan:
             raise ConfigError(
                 f"segmentation_of: expected names of cameras ({', '.join(names)}), got {', '.join(unknown)}"
             )
+        for name, section in c.segmentation_of.items():
+            if not isinstance(section, Mapping | None):
+                raise ConfigError(f"segmentation_of: {name}: expected a section of parameters, got {section!r:.80}")
         # Our own publishers are reliable, and nothing may be lost; a camera driver may offer best effort only.
         reliability = "best_effort" if c.source == "cameras" else "reliable"
         common = {

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
     from limbloc_ros.nodes.graph_plan import SmartSpaceConfig
 
-#: Exit code after Ctrl-C before the processes were started.
-EXIT_INTERRUPTED = 130
+#: Exit codes, as of `limbloc`: wrong input, and Ctrl-C before the processes were started.
+EXIT_INPUT, EXIT_INTERRUPTED = 2, 130
 
 DESCRIPTION = "The whole smart space from one YAML file: cameras, masks, hull, posture, in few processes."
 
@@ -77,13 +77,8 @@ def config_from_arguments(options: argparse.Namespace) -> SmartSpaceConfig:
         key, equals, value = text.partition("=")
         if not equals or not key:
             raise ConfigError(f"--set: expected KEY=VALUE such as pose.fit.engine=paper, got {text!r}")
-        section, names = overrides, key.split(".")
-        for name in names[:-1]:
-            section = section.setdefault(name, {})
-            if not isinstance(section, dict):
-                raise ConfigError(f"--set: {key} lies inside of a value that was set before")
         try:
-            section[names[-1]] = yaml_values(value)
+            _put(overrides, key, yaml_values(value))
         except ValueError as error:
             raise ConfigError(f"--set {text}{error}") from None
     for key, value in (("source", options.source), ("rig", options.rig), ("bag", options.bag)):
@@ -94,10 +89,22 @@ def config_from_arguments(options: argparse.Namespace) -> SmartSpaceConfig:
     if options.foxglove is not None:
         overrides["foxglove"] = True
         if options.foxglove:
-            overrides.setdefault("foxglove_bridge", {})["port"] = options.foxglove
+            _put(overrides, "foxglove_bridge.port", options.foxglove)
     if options.cameras is not None:
         overrides["cameras"] = [name.strip() for name in options.cameras.split(",") if name.strip()]
     return load_config(options.config or config_file("smart_space.yaml"), overrides)
+
+
+def _put(values: dict[str, Any], key: str, value: Any) -> None:
+    """Set `key`, a path with dots; raises ConfigError where `--set` made a plain value of a section on the way."""
+    from limbloc_ros.core.errors import ConfigError
+
+    *sections, name = key.split(".")
+    for section in sections:
+        values = values.setdefault(section, {})
+        if not isinstance(values, dict):
+            raise ConfigError(f"{key} lies inside of {section}, which --set made {values!r:.40}; leave that --set away")
+    values[name] = value
 
 
 def run(config: SmartSpaceConfig) -> int:
@@ -147,7 +154,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return run(config_from_arguments(options))
     except LimblocError as error:
         print(f"smart_space: {error}", file=sys.stderr)
-        return 1
+        return EXIT_INPUT
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
 
