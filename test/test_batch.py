@@ -111,6 +111,12 @@ def test_finished_recordings_are_not_done_again(recordings, here):
     assert (here / "long" / "run.npz").stat().st_mtime_ns == before
 
 
+def test_what_process_has_done_is_not_done_again(recordings, tmp_path):
+    command = ["process", str(recordings / "short"), "--temporal", "--jobs", "1", "--out", str(tmp_path / "short")]
+    assert cli.main(command) == 0
+    assert do(Task(recordings / "short", tmp_path / "short", None, CONFIG)).done_before
+
+
 def test_results_of_other_parameters_are_not_taken_for_these(recordings, here):
     outcome = do(Task(recordings / "long", here / "long", None, CONFIG, leave_out=1))
     assert "holds results of another recording or other parameters" in outcome.error

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command line as a person meets it: help, one-line errors, exit codes, Ctrl-C and going on."""
 
+import dataclasses
 import os
 import shutil
 import signal
@@ -14,6 +15,8 @@ import pytest
 
 from limbloc_ros import cli
 from limbloc_ros.recordings.results import Run
+from limbloc_ros.recordings.sources import rig_identity
+from limbloc_ros.rig.rig_file import load_rig, save_rig
 
 ROOT = Path(__file__).parents[1]
 CASE = ROOT / "test" / "data" / "benchmark" / "public_few" / "cams4_p_man_avg"
@@ -87,6 +90,40 @@ def test_process_writes_results_and_a_report(short_case, tmp_path):
     assert [p.name for p in only.parent.iterdir()] == ["short.npz"]
     with np.load(only) as a, np.load(out / "joints.npz") as b:
         np.testing.assert_array_equal(a["joints"], b["joints"])
+
+
+def test_results_of_another_recording_or_rig_are_not_replaced_unawares(short_case, tmp_path, capsys):
+    out, other = tmp_path / "out", tmp_path / "other"
+    command = ["process", str(short_case), "--out", str(out), "--jobs", "1", "--temporal"]
+    assert cli.main(command) == 0
+    before = (out / "run.npz").read_bytes()
+    shutil.copytree(short_case, other)
+    assert cli.main(["process", str(other), *command[2:]]) == 2
+    error = capsys.readouterr().err
+    assert f"{out} holds the results of another recording, {short_case}, and this is {other}" in error
+    assert "choose another --out, or replace them with --overwrite" in error
+    rig = load_rig(short_case / "calib.json")
+    wider = [dataclasses.replace(c, K=c.K * [[1.01], [1], [1]]) if c.name == "cam0" else c for c in rig.cameras]
+    save_rig(dataclasses.replace(rig, cameras=tuple(wider)), tmp_path / "rig.yaml")
+    assert cli.main([*command, "--rig", str(tmp_path / "rig.yaml")]) == 2
+    assert f"this recording with another rig, {out / 'rig.yaml'}" in capsys.readouterr().err
+    assert (out / "run.npz").read_bytes() == before
+    assert cli.main(command) == 0  # the same again
+    assert cli.main(["process", str(other), *command[2:], "--overwrite"]) == 0
+    assert Run.load(out).about["input"] == str(other)
+    (out / "run.json").write_text("[]")
+    capsys.readouterr()
+    assert cli.main(command) == 2
+    assert "holds results that cannot be read" in capsys.readouterr().err
+    assert cli.main(["demo", "--out", str(out)]) == 2
+    assert "holds a demo or results already" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("folder", ["benchmark/public_few/cams4_p_man_avg/calib.json", "rgb_walk/calib.json"])
+def test_the_rig_of_a_run_is_the_one_it_was_made_with(folder, tmp_path):
+    rig = load_rig(ROOT / "test" / "data" / folder)
+    save_rig(rig, tmp_path / "rig.yaml")
+    assert rig_identity(load_rig(tmp_path / "rig.yaml")) == rig_identity(rig)
 
 
 @pytest.mark.parametrize("after_s", [0.2, 1.0])  # while the workers import, or load kernels, or fit

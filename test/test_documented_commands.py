@@ -67,9 +67,9 @@ class Lab:
 
     def provide(self, words):
         """Put there what a command line reads."""
-        for word in words:
+        for before, word in zip(["", *words], words, strict=False):
             name = word.rstrip("/")
-            if re.fullmatch(r"[A-Za-z][\w./*-]*", name) and not (self.folder / name).exists():
+            if before != "--out" and re.fullmatch(r"[A-Za-z][\w./*-]*", name) and not (self.folder / name).exists():
                 self._provide(name)
 
     def _provide(self, name):

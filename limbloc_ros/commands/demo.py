@@ -67,8 +67,8 @@ def run(args: argparse.Namespace) -> int:
     """Do it."""
     check(args)
     out = args.out or Path("out") / f"demo-{datetime.now():%Y%m%d-%H%M%S}"
-    if (out / "bag").exists():
-        raise InputError(f"{out} holds a demo already; choose another --out or remove it")
+    if (out / "bag").exists() or (out / "run.json").exists():
+        raise InputError(f"{out} holds a demo or results already; choose another --out or remove it")
     out.mkdir(parents=True, exist_ok=True)
     _run_live(args, out)
     if args.no_report:

@@ -21,7 +21,8 @@ from limbloc_ros.recordings.config_file import load_config
 from limbloc_ros.recordings.kept_frames import KeptFrames
 from limbloc_ros.recordings.offline import OfflineConfig
 from limbloc_ros.recordings.open_source import open_source
-from limbloc_ros.recordings.results import Run
+from limbloc_ros.recordings.results import Run, read_about
+from limbloc_ros.recordings.sources import Source, rig_identity
 from limbloc_ros.rig.rig_file import load_rig
 
 DESCRIPTION = """\
@@ -45,7 +46,8 @@ examples:
   limbloc process test/data/benchmark/public/seq_wave --out predictions/seq_wave.npz
 
 Without --background the first frames of a recording must show the empty room (15 of them by default). Ctrl-C keeps
-what is done; the same command goes on from there. Any number of --jobs gives the same result.
+what is done; the same command goes on from there. Any number of --jobs gives the same result. The same recording may be
+worked out again into its OUT; results of another recording or rig are only replaced with --overwrite.
 """
 
 
@@ -54,6 +56,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("input", type=Path, metavar="INPUT", help="bag, folder of videos or images, or benchmark case")
     parser.add_argument("--rig", type=Path, help="rig YAML or calib.json with the calibrated cameras")
     parser.add_argument("--out", type=Path, help="folder for the results, or a .npz file (default: out/<INPUT's name>)")
+    parser.add_argument(
+        "--overwrite", action="store_true", help="replace the results of another recording or rig that are in OUT"
+    )
     parser.add_argument("--report", action="store_true", help="also make pictures and a page (OUT/report/report.html)")
     add_options(parser)
 
@@ -116,6 +121,8 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"--report needs a folder, but --out {out} is a file; leave the .npz away")
     if out.exists() and out.is_dir() == only_joints:
         raise InputError(f"--out {out} is {'a folder' if only_joints else 'a file'}; choose another name")
+    if not only_joints and not args.overwrite:
+        refuse_others_results(out, source)
     partial = out.with_name(f"{out.name}.partial") if only_joints else out / ".partial"
     kept = KeptFrames()
     say(f"{source.about['kind']} {args.input}: {len(source.rig.cameras)} cameras, engine {config.fit.engine}")
@@ -152,6 +159,23 @@ def run(args: argparse.Namespace) -> int:
 
         make_report(out)
     return 0
+
+
+def refuse_others_results(out: Path, source: Source) -> None:
+    """Raise InputError when `out` holds the finished run of another recording, or of this one with another rig."""
+    advice = "choose another --out, or replace them with --overwrite"
+    try:
+        about = read_about(out / "run.json")  # the last file that a run writes
+    except InputError as error:
+        raise InputError(f"{out} holds results that cannot be read ({error}); {advice}") from None
+    if not about:
+        return
+    before, now = str(about.get("input", "")), str(source.about["input"])
+    if Path(before).resolve() != Path(now).resolve():
+        raise InputError(f"{out} holds the results of another recording, {before}, and this is {now}; {advice}")
+    rig_file = out / "rig.yaml"
+    if rig_file.is_file() and rig_identity(load_rig(rig_file)) != rig_identity(source.rig):
+        raise InputError(f"{out} holds the results of this recording with another rig, {rig_file}; {advice}")
 
 
 def summary(result: Run, out: Path, seconds: float) -> str:

@@ -80,7 +80,6 @@ def do(task: Task, jobs: int = 1) -> Outcome:
         offline.prepare()
         partial, kept = task.out / ".partial", KeptFrames()
         run = offline.process(source, task.config, partial=partial, jobs=jobs, leave_out=task.leave_out, kept=kept)
-        run.about["key"] = key
         save_folder(run, source.rig, kept, task.out)
         return _outcome(task, run)
     except LimblocError as error:

@@ -96,7 +96,8 @@ def process(
         raise InputError(f"jobs: expected 0 (one per core) or more, got {jobs}")
     # A temporal frame depends on all before it, so that half a run is of no use.
     keep = partial is not None and not config.fit.temporal
-    checkpoint = Checkpoint(partial if keep else None, run_key(source, config, leave_out))
+    key = run_key(source, config, leave_out)
+    checkpoint = Checkpoint(partial if keep else None, key)
     if checkpoint.discarded:
         say(f"the unfinished run in {partial} was of other input or settings; starting anew")
     done = checkpoint.done
@@ -138,7 +139,8 @@ def process(
         say(note)
     if not frames:
         raise InputError(f"{source.about['input']}: no frame could be made of it; " + "; ".join(source.notes))
-    about = {**source.about, "left_out": leave_out, "config": dataclasses.asdict(config), "version": __version__}
+    settings = {"left_out": leave_out, "config": dataclasses.asdict(config), "version": __version__, "key": key}
+    about = {**source.about, **settings}
     return Run(tuple(frames), about)
 
 

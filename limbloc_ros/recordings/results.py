@@ -224,7 +224,7 @@ class Run:
         frames = load_frames(folder / "run.npz")
         for other in sorted((folder / PEOPLE).glob("p*/run.npz")):
             frames = with_others(frames, load_frames(other))
-        return Run(frames, _read_about(folder / "run.json"))
+        return Run(frames, read_about(folder / "run.json"))
 
 
 #: Folder of the single people's runs within a run's.
@@ -357,8 +357,8 @@ def _check_layout(data: dict[str, NDArray[Any]]) -> None:
         raise ValueError("flesh_parts names spheres that are not there")
 
 
-def _read_about(path: Path) -> dict[str, Any]:
-    """`run.json`; {} without one."""
+def read_about(path: Path) -> dict[str, Any]:
+    """What a `run.json` says; {} without one. Raises InputError when it is damaged."""
     if not path.is_file():
         return {}
     about = read_values(path, "run's description", "the run.json in it", InputError)
