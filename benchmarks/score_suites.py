@@ -5,6 +5,8 @@
 python benchmarks/score_suites.py                         all suites, robust engine, each frame alone
 python benchmarks/score_suites.py --engine paper public
 python benchmarks/score_suites.py --temporal --sequences  sequences only, each frame from the one before
+
+Predictions and scores.json go to out/scores/robust, out/scores/paper, out/scores/robust_temporal, ...
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ import argparse
 import json
 import statistics
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +47,7 @@ HEAD = (
 )  # fmt: skip
 
 
-def main() -> None:
+def main(argv: Sequence[str] | None = None) -> None:
     """Run, score, print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("suites", nargs="*", help="suites to run (default: all)")
@@ -53,8 +56,11 @@ def main() -> None:
     parser.add_argument("--sequences", action="store_true", help="only cases whose frames follow each other")
     parser.add_argument("--jobs", type=int, default=0, help="processes (default: one per core)")
     parser.add_argument("--data", type=Path, default=DATA, help="folder of suites")
-    parser.add_argument("--out", type=Path, default=Path("out/scores"), help="predictions and scores.json go there")
-    args = parser.parse_args()
+    parser.add_argument("--out", type=Path, default=Path("out/scores"), help="a folder per engine goes there")
+    args = parser.parse_args(argv)
+    if unknown := set(args.suites) - {suite for _, suite, _ in ROWS}:
+        parser.error(f"expected suites such as public, got {', '.join(sorted(unknown))}")
+    out = args.out / (f"{args.engine}_temporal" if args.temporal else args.engine)
     config = OfflineConfig(fit=FitConfig(engine=args.engine, temporal=args.temporal))
     offline.prepare(lambda text: print(text, file=sys.stderr))
     rows = []
@@ -63,10 +69,11 @@ def main() -> None:
         if args.sequences:
             cases = [c for c in cases if json.loads((c / "meta.json").read_text())["kind"] == "sequence"]
         if cases and (not args.suites or suite in args.suites):
-            rows.append(run_row(title, cases, config, args.jobs, args.out / args.engine / suite))
+            rows.append(run_row(title, cases, config, args.jobs, out / suite))
     text = table(rows)
     print(f"\nengine {args.engine}{', temporal' if args.temporal else ', each frame alone'}; 13 limb joints\n\n{text}")
-    (args.out / "scores.json").write_text(json.dumps(rows, indent=1) + "\n")
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "scores.json").write_text(json.dumps(rows, indent=1) + "\n")
 
 
 def run_row(title: str, cases: list[Path], config: OfflineConfig, jobs: int, out: Path) -> dict[str, Any]:
