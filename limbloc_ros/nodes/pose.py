@@ -28,12 +28,9 @@ from limbloc_ros.ros import messages, node_main, topics
 from limbloc_ros.ros.backlog import Backlog
 from limbloc_ros.ros.body_output import BodiesOutput
 from limbloc_ros.ros.cloud_messages import cloud_to_hull, surface_to_cloud
-from limbloc_ros.ros.health import Health, Meter
+from limbloc_ros.ros.health import SILENT_S, Health, Meter
 from limbloc_ros.ros.messages import NANOSECONDS, OK, WARN, make_status, stamp_ns
 from limbloc_ros.ros.parameters import NodeParameters
-
-#: Longer without a hull is worth a warning.
-SILENT_S = 2.0
 
 
 @dataclass(frozen=True)

@@ -21,11 +21,9 @@ from limbloc_ros.core.pipeline import CUT_M2
 from limbloc_ros.core.synchroniser import FrameSet, StampSynchroniser, SyncCounters
 from limbloc_ros.rig.watch import ConsistencyWatch
 from limbloc_ros.ros.backlog import Backlog
-from limbloc_ros.ros.health import WINDOW_S, Meter
+from limbloc_ros.ros.health import SILENT_S, WINDOW_S, Meter
 from limbloc_ros.ros.messages import ERROR, OK, WARN, make_status
 
-#: Longer without a mask or a set is worth a warning.
-SILENT_S = 2.0
 #: A camera that is missing in a larger share of the last seconds' sets is named, with what is known of the cause.
 MISSING_SHARE = 0.2
 #: Stamps this much older or younger on arrival than the other cameras' are given as the cause, s.

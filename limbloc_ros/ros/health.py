@@ -25,6 +25,8 @@ from limbloc_ros.ros.messages import ERROR, OK, worst
 PERIOD_S = 1.0
 #: Rates are counted over this long, and a fault is shown and not logged again for this long.
 WINDOW_S = 5.0
+#: Longer without a message of a stream that should flow is worth a warning.
+SILENT_S = 2.0
 #: What a harder frame needed is given back to the system this often.
 GIVE_BACK_S = 10.0
 
