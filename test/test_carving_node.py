@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from array import array
 from dataclasses import replace
@@ -12,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import PoseArray
 from rclpy.parameter import Parameter
 from ros_graph import Graph
 from sensor_msgs.msg import CompressedImage, Image, PointCloud2
@@ -23,7 +25,7 @@ from limbloc_ros.core.hull import Hull
 from limbloc_ros.core.pipeline import Carver
 from limbloc_ros.nodes.carving import CarvingNode
 from limbloc_ros.rig.rig_file import save_rig
-from limbloc_ros.ros import topics
+from limbloc_ros.ros import carving_report, topics
 from limbloc_ros.ros.cloud_messages import cloud_to_hull
 from limbloc_ros.ros.image_messages import mask_to_compressed, mask_to_image
 from limbloc_ros.ros.messages import make_header, stamp_ns
@@ -133,6 +135,35 @@ def test_a_dead_camera_is_named_and_the_others_go_on(graph: Graph, rig: Rig, rig
     assert status.level == DiagnosticStatus.ERROR
     assert all(f"/cam{k}/mask/compressed" in status.message for k in range(3))  # what there is instead
     graph.until(lambda: cameras.diagnostics.value("carving: camera cam3", "missing") == "7")
+
+
+def test_a_pose_node_that_died_is_missed(
+    graph: Graph, rig: Rig, rig_file: str, person: Masks, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It cannot say so itself; who never heard it misses nothing."""
+    monkeypatch.setattr(carving_report, "SILENT_S", 0.3)
+    node = graph.add(CarvingNode, rig_file=rig_file)
+    cameras = Cameras(graph, rig.names)
+    numbers = itertools.count()
+    for _ in range(3):
+        cameras.hull(empty(person), next(numbers))
+        graph.spin(0.2)
+    assert cameras.diagnostics["carving: hull"].level == DiagnosticStatus.OK
+    pose = graph.publisher(PoseArray, topics.JOINTS)
+    pose.publish(PoseArray())
+    graph.until(lambda: node.report.answered_once)
+
+    def carve_until_it_says(*words: str) -> None:
+        said = cameras.diagnostics.says("carving: hull", *words)
+        while not said():
+            cameras.hull(empty(person), next(numbers))
+            graph.spin(0.02)
+            assert next(numbers) < 1000
+
+    carve_until_it_says("no poses come", "is the pose node down?")
+    assert cameras.diagnostics["carving: hull"].level == DiagnosticStatus.WARN
+    pose.publish(PoseArray())
+    carve_until_it_says("no person")
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import PoseArray
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from sensor_msgs.msg import CompressedImage, Image, PointCloud2
@@ -88,6 +89,8 @@ class CarvingNode(Node):
         for name, topic in mask_topics.items():
             self.create_subscription(kind, topic, self.make_callback(name), topics.WORK_QOS)
         self.create_subscription(Header, topics.FRAMES_SKIPPED, self.on_skipped, topics.STREAM_QOS)
+        # A pose node that died cannot say so; whose hulls are not answered can.
+        self.create_subscription(PoseArray, topics.JOINTS, lambda _: self.report.answered(), topics.STREAM_QOS)
         self.create_timer(TICK_S, self.on_tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def mask_topic(self, camera: str) -> str:

@@ -23,6 +23,7 @@ from limbloc_ros.rig.watch import ConsistencyWatch
 from limbloc_ros.ros.backlog import Backlog
 from limbloc_ros.ros.health import SILENT_S, WINDOW_S, Meter
 from limbloc_ros.ros.messages import ERROR, OK, WARN, make_status
+from limbloc_ros.ros.topics import JOINTS
 
 #: A camera that is missing in a larger share of the last seconds' sets is named, with what is known of the cause.
 MISSING_SHARE = 0.2
@@ -36,6 +37,9 @@ class CarvingReport:
     Args:
         node: named in every entry; asked for what topics exist.
         topics: mask topic by camera.
+
+    Attributes:
+        answered_once: whether some pose node has ever answered a hull.
     """
 
     def __init__(self, node: Node, topics: Mapping[str, str]) -> None:
@@ -53,6 +57,8 @@ class CarvingReport:
         self._past: deque[tuple[float, SyncCounters]] = deque()
         self._missing: deque[tuple[float, tuple[str, ...]]] = deque()
         self._jumps, self._jumped_s = 0, -WINDOW_S
+        self._asked_s: float | None = None
+        self.answered_once = False
 
     def mask(self, camera: str, mask: Pixels, latency_s: float) -> None:
         """A usable mask came."""
@@ -64,6 +70,11 @@ class CarvingReport:
         self._last, self._outcome, self._carve_ms = frames, outcome, carve_ms
         self._sets.tick(latency_s)
         self._missing.append((time.monotonic(), frames.missing))
+        self._asked_s = self._asked_s or time.monotonic()
+
+    def answered(self) -> None:
+        """The pose node answered a hull: with a pose, or with none."""
+        self._asked_s, self.answered_once = None, True
 
     def statuses(
         self,
@@ -131,6 +142,10 @@ class CarvingReport:
             )
         if backlog.behind:
             level, message = WARN, backlog.behind
+        waited_s = time.monotonic() - self._asked_s if self._asked_s else 0.0
+        if self.answered_once and waited_s > SILENT_S:
+            level = WARN
+            message = f"no poses come: no hull was answered on {JOINTS} for {waited_s:.0f} s; is the pose node down?"
         if synchroniser is None:
             level, message = ERROR, f"no rig yet: {'; '.join(problems.values()) or 'waiting for CameraInfo and TF'}"
         elif self._sets.silence_s > SILENT_S:

@@ -95,7 +95,7 @@ def _of_kind(kind: str, parameters: Mapping[str, Any], cameras: Sequence[str]) -
         masks = [mask_of[parameters.get("mask_transport", "compressed")](camera) for camera in cameras]
         if not parameters.get("rig_file"):
             masks += [*(topics.camera_info(camera) for camera in cameras), "/tf", "/tf_static"]
-        return Access((topics.HULL, topics.DIAGNOSTICS), (*masks, topics.FRAMES_SKIPPED))
+        return Access((topics.HULL, topics.DIAGNOSTICS), (*masks, topics.FRAMES_SKIPPED, topics.JOINTS))
     if kind == "pose":
         own = (topics.JOINTS, topics.JOINT_ANGLES, topics.MARKERS, topics.SURFACE, *_BODIES, topics.BODIES_TRACKED)
         tf = () if parameters.get("publish_tf") == "none" else ("/tf",)
