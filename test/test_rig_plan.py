@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Planning: proposals that can be carved with, counts worked by hand, blind spots, and the hull's fatness."""
 
+import itertools
+
 import cv2
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ from limbloc_ros import cli
 from limbloc_ros.core.camera import Camera, Rig
 from limbloc_ros.core.errors import ConfigError
 from limbloc_ros.rig.geometry import where_they_look
+from limbloc_ros.rig.pictures import rig_figure
 from limbloc_ros.rig.plan import (
     blind_spots,
     cover_floor,
@@ -130,3 +133,14 @@ def test_the_command_line(tmp_path, capsys):
     ):
         assert cli.main(["rig", "plan", *wrong]) == 2
         assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("count", [8, 16, 32])
+def test_no_name_hides_another_in_the_picture(count):
+    rig = propose(count, (5.0, 5.0, 2.8), size=(1280, 720), view_deg=80.0)
+    figure = rig_figure(rig.cameras, rig.volume_min, rig.volume_max)
+    for axes in figure.axes:
+        boxes = {text.get_text(): text.get_window_extent() for text in axes.texts}
+        assert set(boxes) == set(rig.names)
+        for one, other in itertools.combinations(boxes, 2):
+            assert not boxes[one].overlaps(boxes[other]), (one, other)

@@ -12,7 +12,9 @@ from matplotlib import colormaps
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
+from matplotlib.transforms import Bbox
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
+from mpl_toolkits.mplot3d.proj3d import proj_transform
 from numpy.typing import NDArray
 
 from limbloc_ros.core.camera import Camera, Rig
@@ -24,8 +26,9 @@ Mask = NDArray[np.uint8]
 DPI = 110
 #: Lets a name be read on top of lines and colours.
 _HALO = [withStroke(linewidth=2.5, foreground="white")]
-#: Names stand so far outside of the cameras, m.
+#: Names stand so far outside of the cameras, m; in 3D pictures so far beside them, points: the nearest that is free.
 _LABEL_M = 0.12
+_LABEL_POINTS = (6.0, 14.0, 22.0)
 #: Room for them around the cameras, m.
 _MARGIN_M = 0.65
 #: Colours that also colour-blind people tell apart, one after the other for the cameras.
@@ -178,19 +181,57 @@ def fatness_plot(counts: Sequence[int], factors: Sequence[Sequence[float]]) -> b
     return png(figure)
 
 
-def _name(axes: Any, camera: Camera, low: Array, high: Array, *, above_m: float | None = None) -> None:
-    """Write a camera's name beside it, further from the middle of the volume; in 3D axes `above_m` higher."""
-    place = camera.T_world_camera[:3, 3]
-    away = place[:2] - (low + high)[:2] / 2
-    away = away / max(float(np.linalg.norm(away)), 1e-9)
-    x, y = place[:2] + _LABEL_M * away
-    how: dict[str, Any] = {"fontsize": 8, "path_effects": _HALO, "zorder": 100}
-    how["ha"] = ("right", "center", "left")[round(away[0]) + 1]
-    how["va"] = ("top", "center", "bottom")[round(away[1]) + 1]
-    if above_m is None:
-        axes.text(x, y, camera.name, **how)
-    else:
-        axes.text(x, y, place[2] + above_m, camera.name, **how)
+def _name(axes: Any, camera: Camera, low: Array, high: Array) -> None:
+    """Write a camera's name on a floor plan, beside it, further from the middle of the volume."""
+    away = _away(camera, low, high)[:2]
+    x, y = camera.T_world_camera[:2, 3] + _LABEL_M * away
+    axes.text(x, y, camera.name, fontsize=8, path_effects=_HALO, zorder=100, **_aligned(away))
+
+
+def _away(camera: Camera, low: Array, high: Array) -> Array:
+    """Unit vector [3] from the middle of the volume to a camera, level."""
+    away = (camera.T_world_camera[:3, 3] - (low + high) / 2) * (1, 1, 0)
+    return np.asarray(away / max(float(np.linalg.norm(away)), 1e-9))
+
+
+def _aligned(direction: Array) -> dict[str, Any]:
+    """How a text is aligned that stands in this direction [2] of what it names."""
+    return {
+        "ha": ("right", "center", "left")[round(direction[0]) + 1],
+        "va": ("top", "center", "bottom")[round(direction[1]) + 1],
+    }
+
+
+def _name_apart(axes: Any, cameras: Sequence[Camera], low: Array, high: Array) -> None:
+    """Write the names of all cameras into 3D axes that are laid out already, where they hide no name and no camera.
+
+    Best is further from the middle of the volume, and above.
+    """
+
+    def shown(point: Array) -> Array:
+        return np.array(proj_transform(*point, axes.get_proj())[:2])
+
+    renderer = axes.figure.canvas.get_renderer()
+    dots = [shown(camera.T_world_camera[:3, 3]) for camera in cameras]
+    taken = [Bbox.from_bounds(x - 4, y - 4, 8, 8) for x, y in map(axes.transData.transform, dots)]
+    turns = np.linspace(0, 2 * np.pi, 8, endpoint=False)
+    ways = np.column_stack([np.cos(turns), np.sin(turns)])
+    for i, camera in enumerate(cameras):
+        outside = _LABEL_M * np.add(_away(camera, low, high), (0.0, 0.0, 1.0))
+        best = shown(camera.T_world_camera[:3, 3] + outside) - dots[i]
+        places = [(points * way, way) for points in _LABEL_POINTS for way in sorted(ways, key=lambda w: -(w @ best))]
+        text = axes.annotate(
+            camera.name, dots[i], (0, 0), textcoords="offset points", fontsize=8, path_effects=_HALO, zorder=100
+        )
+        hidden = []
+        for offset, way in places:
+            text.set(position=offset, **_aligned(way))
+            box = text.get_window_extent(renderer)
+            shared = (Bbox.intersection(box, other) for j, other in enumerate(taken) if j != i)
+            hidden.append(sum(both.width * both.height for both in shared if both is not None))
+        offset, way = places[int(np.argmin(hidden))]
+        text.set(position=offset, **_aligned(way))
+        taken.append(text.get_window_extent(renderer))
 
 
 def frustum(camera: Camera, depth_m: float) -> Array:
@@ -203,7 +244,12 @@ def frustum(camera: Camera, depth_m: float) -> Array:
     return np.vstack([T[:3, 3], points @ T[:3, :3].T + T[:3, 3]])
 
 
-def rig_picture(
+def rig_picture(cameras: Sequence[Camera], low: Array, high: Array, **options: Any) -> bytes:
+    """`rig_figure` as PNG."""
+    return png(rig_figure(cameras, low, high, **options), tight=True)
+
+
+def rig_figure(
     cameras: Sequence[Camera],
     low: Array,
     high: Array,
@@ -211,7 +257,7 @@ def rig_picture(
     title: str = "",
     extra: Callable[[Any], None] | None = None,
     person_m: float = 1.75,
-) -> bytes:
+) -> Figure:
     """The cameras with their views in 3D: from the side, and from above.
 
     Args:
@@ -229,7 +275,6 @@ def rig_picture(
         depth_m = np.clip(6.0 / len(cameras), 0.5, 0.9) * (1.0 if column == 0 else 1.6)  # many must not hide each other
         for i, camera in enumerate(cameras):
             _draw_camera(axes, camera, colour(i), float(depth_m))
-            _name(axes, camera, low, high, above_m=0.1 if column == 0 else 0.0)
         _draw_room(axes, low, high, person_m)
         if extra is not None:
             extra(axes)
@@ -251,7 +296,12 @@ def rig_picture(
         if column == 1:
             axes.set_proj_type("ortho")
             axes.set_zticks([])
-    return png(figure, tight=True)
+    FigureCanvasAgg(figure)
+    figure.draw_without_rendering()
+    figure.set_layout_engine("none")  # names stand where the cameras are now
+    for axes in figure.axes:
+        _name_apart(axes, cameras, low, high)
+    return figure
 
 
 def _draw_camera(axes: Any, camera: Camera, shade: str, depth_m: float) -> None:
