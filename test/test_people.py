@@ -144,7 +144,9 @@ def at(x: float, y: float, good: bool = True) -> tuple[Part, Pose]:
     part = Part.of(hull)
     return (
         Part(part.points + shift, part.centre + shift, part.volume_m3),
-        dataclasses.replace(pose, joints=pose.joints + shift, parameters=moved.to_vector(), reliable=good),
+        dataclasses.replace(
+            pose, joints=pose.joints + shift, parameters=moved.to_vector(), reliable=good, risk=1.0 - good
+        ),
     )
 
 

@@ -196,14 +196,14 @@ def test_a_damaged_cloud_is_named_and_the_node_goes_on(graph: Graph, hull: Hull,
 
 def test_an_unreliable_fit_is_shown_but_not_told_as_fact(graph: Graph, hull: Hull, offline: Pose) -> None:
     node = graph.add(PoseNode)
-    doubtful = dataclasses.replace(offline, reliable=False, energy=0.7)
+    doubtful = dataclasses.replace(offline, reliable=False, doubt="the left arm hides")
     node.estimator.estimate = lambda *_: doubtful
     states, markers = graph.collect(JointState, "humans/bodies/p1/joint_states"), graph.collect(MarkerArray, "markers")
     carvings = Carvings(graph)
     graph.until(lambda: node.markers.get_subscription_count() == 1)
     assert message_to_joints(carvings.send(hull, 0)) is None
     graph.until(lambda: len(markers) == 1)
-    graph.until(carvings.diagnostics.says("pose: posture", "not reliable", "0.70"))
+    graph.until(carvings.diagnostics.says("pose: posture", "not reliable (the left arm hides)"))
     assert carvings.diagnostics["pose: posture"].level == DiagnosticStatus.WARN
     assert not states
     node.set_parameters([Parameter("publish_unreliable", value=True)])

@@ -30,6 +30,8 @@ def make_pose(seed):
         sigma=rng.uniform(size=len(JOINT_NAMES)),
         reliable=bool(seed % 2),
         stage_ms={"search": 3.5},
+        risk=rng.uniform(),
+        doubt="" if seed % 2 else "an arm shows nowhere",
     )
 
 
@@ -53,7 +55,7 @@ def assert_same(a, b):
         return
     for name in ("joints", "rotations", "parameters", "sigma"):
         np.testing.assert_array_equal(getattr(a.outcome, name), getattr(b.outcome, name))
-    for name in ("bone_names", "angles", "sizes", "energy", "reliable", "stage_ms"):
+    for name in ("bone_names", "angles", "sizes", "energy", "reliable", "stage_ms", "risk", "doubt"):
         assert getattr(a.outcome, name) == getattr(b.outcome, name)
     for name in ("centres", "radii", "parts"):
         np.testing.assert_array_equal(getattr(a.outcome.flesh, name), getattr(b.outcome.flesh, name))
@@ -68,6 +70,16 @@ def test_frames_come_back_bit_for_bit(tmp_path, empty_only):
     assert len(again) == len(frames)
     for a, b in zip(again, frames, strict=True):
         assert_same(a, b)
+
+
+def test_a_run_from_before_doubts_were_told_can_be_read(tmp_path):
+    save_frames(make_frames(), tmp_path / "run.npz")
+    with np.load(tmp_path / "run.npz") as data:
+        older = {name: array for name, array in data.items() if name not in ("risk", "doubts")}
+    np.savez(tmp_path / "run.npz", **older)
+    poses = [frame.outcome for frame in load_frames(tmp_path / "run.npz") if isinstance(frame.outcome, Pose)]
+    assert [pose.reliable for pose in poses] == [False, True, True]
+    assert [(pose.doubt, pose.risk) for pose in poses] == [("", 1.0), ("", 0.0), ("", 0.0)]
 
 
 def test_joints_file_is_what_the_benchmark_reads(tmp_path):

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -14,18 +15,34 @@ from limbloc_ros.core.figure import FigureState
 from limbloc_ros.core.hull import Hull
 from limbloc_ros.core.joint_angles import native_angles
 from limbloc_ros.core.lm import System
-from limbloc_ros.core.pose import JOINT, JOINT_NAMES, STICK_BONES, Pose
+from limbloc_ros.core.pose import JOINT, JOINT_NAMES, STICK_BONES, Flesh, Pose
+from limbloc_ros.core.surface import Surface
+from limbloc_ros.core.unexplained import SIDES, Outlines, forearm_depths_m, meet_outlines
 
 Array = NDArray[np.float64]
 Rivals = Sequence[tuple[FigureState, float]]
 
-#: XOR energy, smooth cost (m^2) and largest joint sigma (m) above which a pose is not to be acted on. Over the public
-#: suites this catches a third of the few frames that fail, at 4 false alarms in 100 (see docs/benchmarks.md).
-RELIABLE_XOR, RELIABLE_COST, RELIABLE_SIGMA = 0.62, 2.8e-4, 0.25
+#: A hull that the carve volume's walls cut by more than this, m^2, is no whole person; an arm is thinner.
+CUT_M2 = 0.02
+#: A figure of this XOR energy is none of that hull.
+NO_MATCH_XOR = 0.62
+#: The chance that some joint of the limbs is 15 cm off from which on a pose is not to be acted on. Its log-odds are
+#: those of a figure without any sign of that, and what is added for each sign (`risk_of`):
+#: - the less an arm adds to the explanation of the outlines: the logarithms of what upper arm and forearm do, of the
+#:   arm that shows less. It is little where masks are ragged, or the arm is before the trunk;
+#: - per m by which an outline passes the figure: the silhouettes show something that it has not;
+#: - per m that a forearm lies in other flesh: the further it is away from the rest of the body, the less is in doubt.
+#: From 850 frames of other people, poses and cameras than the public suites have, and 1,550 of simulated rooms, by
+#: logistic regression; rounded, for what they are fitted to will go on changing.
+DOUBTFUL = 0.08
+USUAL_LOG_ODDS, PER_LOG_SUPPORT, PER_M_PASSED, PER_M_DEEP = -6.1, 1.0, 35.0, 15.0
+#: What these signs are when nothing is wrong; the one that is furthest above that is named.
+USUAL_LOG_SUPPORT, USUAL_PASSED_M, USUAL_DEPTH_M = -1.8, 0.05, -0.17
+#: Less support than this is none.
+LEAST_SUPPORT = 0.003
 #: Error that remains where nothing is in doubt, m; how far the energy's curvature is believed; by how much the energy
 #: of a rival (as a fraction of the least) may be above that before it hardly counts.
 FLOOR_M, BELIEF, RIVAL_WIDTH = 0.010, 0.015, 0.08
-_LIMB_JOINTS = [JOINT[f"{j}_{s}"] for j in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle") for s in "LR"]
 
 
 def joint_sigma(state: FigureState, system: System, rivals: Rivals = ()) -> Array:
@@ -49,8 +66,46 @@ def joint_sigma(state: FigureState, system: System, rivals: Rivals = ()) -> Arra
     return np.asarray(np.sqrt(FLOOR_M**2 + BELIEF * system.cost * curved + apart / weight))
 
 
+def risk_of(hull: Hull, flesh: Flesh, energy: float, outlines: Outlines | None) -> tuple[float, str]:
+    """How likely a figure is wrong, and what says so.
+
+    Args:
+        hull: what it was fitted to.
+        flesh: of the figure.
+        energy: its XOR energy.
+        outlines: how the silhouettes' outlines meet it, if that is known.
+
+    Returns:
+        the chance, 0 to 1, that a joint of its limbs is 15 cm off, and the strongest sign of that in a few words.
+    """
+    if hull.cut_area_m2 >= CUT_M2:
+        return 1.0, "the person reaches out of the carve volume"
+    if energy >= NO_MATCH_XOR:
+        return 1.0, f"the figure does not match the hull: XOR energy {energy:.2f}"
+    if outlines is None:
+        return 0.0, ""
+    shown = np.log(np.maximum(outlines.support, LEAST_SUPPORT)).sum(axis=1)
+    depths = forearm_depths_m(flesh)
+    hidden, deep = int(shown.argmin()), int(depths.argmax())
+    log_odds = {
+        f"the {SIDES[hidden]} arm hardly shows in the silhouettes": PER_LOG_SUPPORT
+        * (USUAL_LOG_SUPPORT - float(shown[hidden])),
+        f"the silhouettes show something {100 * outlines.passed_m:.0f} cm beside the figure": PER_M_PASSED
+        * (outlines.passed_m - USUAL_PASSED_M),
+        f"the {SIDES[deep]} forearm lies close to other parts": PER_M_DEEP * (float(depths[deep]) - USUAL_DEPTH_M),
+    }
+    risk = 1.0 / (1.0 + math.exp(-USUAL_LOG_ODDS - sum(log_odds.values())))
+    return risk, max(log_odds, key=log_odds.__getitem__)
+
+
 def describe_pose(
-    state: FigureState, hull: Hull, system: System | None, stage_ms: Mapping[str, float], rivals: Rivals = ()
+    state: FigureState,
+    hull: Hull,
+    system: System | None,
+    stage_ms: Mapping[str, float],
+    rivals: Rivals = (),
+    surface: Surface | None = None,
+    others: Sequence[Flesh] = (),
 ) -> Pose:
     """Everything that is published about a fitted figure.
 
@@ -60,25 +115,31 @@ def describe_pose(
         system: the smooth energy around the fit, if the engine has one.
         stage_ms: process time of the stages so far, ms.
         rivals: figures that explain the hull nearly as well, with their energy over the least.
+        surface: the hull's; without it the outlines of the silhouettes are not asked whether the pose is reliable.
+        others: where other people are; what they explain of the outlines, this figure need not.
     """
     placed = figure.place(state)
+    flesh = placed.flesh()
     energy = xor_energy(hull, placed)
     sigma = joint_sigma(state, system, rivals) if system is not None else np.full(len(JOINT_NAMES), 0.05)
     sizes = {
         f"{a}-{b}": float(np.linalg.norm(placed.joints[JOINT[a]] - placed.joints[JOINT[b]])) for a, b in STICK_BONES
     }
     sizes["stature"] = float(np.exp(state.shape[0]))
+    outlines = None if surface is None else meet_outlines(hull, surface, flesh, others)
+    risk, sign = risk_of(hull, flesh, energy, outlines)
     return Pose(
         joints=placed.joints,
         rotations=placed.rotations,
         bone_names=figure.BONE_NAMES,
         angles=native_angles(placed.rotations, shape=state.shape),
         sizes=sizes,
-        flesh=placed.flesh(),
+        flesh=flesh,
         parameters=state.to_vector(),
         energy=energy,
         sigma=sigma,
-        reliable=energy < RELIABLE_XOR
-        and (system is None or (system.cost < RELIABLE_COST and float(sigma[_LIMB_JOINTS].max()) < RELIABLE_SIGMA)),
+        reliable=risk < DOUBTFUL,
         stage_ms=dict(stage_ms),
+        risk=risk,
+        doubt=sign if risk >= DOUBTFUL else "",
     )

@@ -11,7 +11,7 @@ has already dropped parts that are too small and phantoms (`hull._people_among`)
    is the surface half-way between them, which is a signed distance too, so that fits see a closed body.
 3. **fits** a figure to what each track got, by a `PoseEstimator` of its own: exactly the chain of a single person.
 4. **judges** newcomers. A part that nobody takes begins a track without a number. It is taken for a person when its
-   fits have been reliable a few times; chairs, tables and boxes never are, and are looked at ever more rarely.
+   fits have explained it a few times; chairs, tables and boxes never are, and are looked at ever more rarely.
 
 People have numbers 1, 2, ...; a newcomer gets the lowest that is free. A number becomes free when its body has not
 been seen for `FORGET_S`; who comes back sooner, near the place, is still the same. The first of the returned bodies is
@@ -58,10 +58,12 @@ SHARE_M, SHARED_VOLUME = 0.12, 0.6
 PERSON, FURNITURE = 3, -3
 REST_S, LONGEST_REST_S, HASTE_S = 2.0, 16.0, 0.8
 MOVED_M, CHANGED = 0.10, 0.10
-#: Who had no reliable fit for so long is no longer taken for a person, s: perhaps it is the chair that somebody left.
+#: Who had no such fit for so long is no longer taken for a person, s: perhaps it is the chair that somebody left.
 DOUBT_S = 10.0
 #: Nobody walks faster, m/s; no prediction reaches further, s.
 FASTEST_M_S, HORIZON_S = 2.5, 0.5
+#: A figure that is that likely wrong need not be a person; one with an arm in the wrong place still is.
+NOBODY = 0.5
 #: Statures of people, m.
 STATURES_M = (0.8, 2.3)
 
@@ -150,7 +152,7 @@ class _Track:
         good = False
         if isinstance(outcome, Pose):
             self.state = FigureState.from_vector(outcome.parameters)
-            good = outcome.reliable and STATURES_M[0] <= outcome.sizes["stature"] <= STATURES_M[1]
+            good = outcome.risk < NOBODY and STATURES_M[0] <= outcome.sizes["stature"] <= STATURES_M[1]
         if good:
             self.trusted_ns = stamp_ns
         self.score = min(max(self.score, 0) + 1, PERSON) if good else max(min(self.score, 0) - 1, FURNITURE)

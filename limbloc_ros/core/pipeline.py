@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import time
 from collections.abc import Mapping, Sequence
@@ -21,11 +20,6 @@ from limbloc_ros.core.pose import Flesh, Pose
 from limbloc_ros.core.silhouettes import measure_silhouettes, pack_cameras
 from limbloc_ros.core.surface import extract_surface
 from limbloc_ros.core.tracker import Tracker
-from limbloc_ros.core.unexplained import UNEXPLAINED_M, unexplained_m
-
-#: A hull that the carve volume's walls cut by more than this, m^2, is no whole person; an arm is thinner.
-CUT_M2 = 0.02
-
 
 #: Calls every kernel of a search once.
 _LEAST_EFFORT = engine_robust.Effort(
@@ -89,7 +83,7 @@ class PoseEstimator:
             clock.lap("fit")
             if isinstance(found, NoPerson):
                 return found
-            return _whole(describe_pose(found[0].state, hull, None, clock.stage_ms), hull)
+            return describe_pose(found[0].state, hull, None, clock.stage_ms)
         surface = extract_surface(hull)
         clock.lap("surface")
         if self.config.temporal:
@@ -99,9 +93,7 @@ class PoseEstimator:
         clock.lap("fit")
         if fit is None:
             return NoPerson("the hull holds nothing that a torso fits into")
-        pose = _whole(describe_pose(fit.state, hull, fit.system, clock.stage_ms, fit.rivals), hull)
-        explained = unexplained_m(hull, surface, pose.flesh, others) < UNEXPLAINED_M
-        return dataclasses.replace(pose, reliable=pose.reliable and explained)
+        return describe_pose(fit.state, hull, fit.system, clock.stage_ms, fit.rivals, surface, others)
 
     def reset(self) -> None:
         """Forget the last frame (a new recording, a jump back in time)."""
@@ -118,11 +110,6 @@ class PoseEstimator:
         estimator._tracker = Tracker(0, searches=(_LEAST_EFFORT,))
         estimator.estimate(hull)
         estimator.estimate(hull)
-
-
-def _whole(pose: Pose, hull: Hull) -> Pose:
-    """The same, and not reliable when the carve volume's walls cut the person: half a person looks like another one."""
-    return dataclasses.replace(pose, reliable=pose.reliable and hull.cut_area_m2 < CUT_M2)
 
 
 class _Stopwatch:

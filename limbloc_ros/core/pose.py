@@ -92,6 +92,8 @@ class Pose:
         sigma: [25] expected error of each joint, m.
         reliable: False when the pose should not be acted on.
         stage_ms: process time of each stage, ms.
+        risk: the chance, 0 to 1, that a joint of its limbs is 15 cm off, as far as the frame alone tells.
+        doubt: why it is not reliable, in a few words; empty when it is, or when that is not known.
     """
 
     joints: Array
@@ -105,6 +107,8 @@ class Pose:
     sigma: Array
     reliable: bool = True
     stage_ms: dict[str, float] = field(default_factory=dict)
+    risk: float = 0.0
+    doubt: str = ""
 
     def joint(self, name: str) -> Array:
         """[3] position of the joint `name`, m."""

@@ -184,11 +184,12 @@ class PoseNode(Node):
             return OK, f"no person: {outcome.reason}"
         values["xor_energy"] = float(outcome.energy)
         values["reliable"] = outcome.reliable
+        values["risk"] = float(outcome.risk)
         values |= {f"{stage}_ms": float(ms) for stage, ms in outcome.stage_ms.items()}
         if outcome.reliable:
             return OK, "tracking"
         told = "" if self.settings.publish_unreliable else ": no joint states are published"
-        return WARN, f"the fit is not reliable (XOR energy {outcome.energy:.2f}){told}"
+        return WARN, f"the fit is not reliable ({outcome.doubt}){told}"
 
     def _on_settings(self, settings: PoseSettings) -> None:
         self.settings = settings

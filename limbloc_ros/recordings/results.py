@@ -307,6 +307,8 @@ def save_frames(frames: Sequence[FrameResult], path: Path) -> None:
             "energy": np.array([p.energy for p in poses]),
             "sigma": np.array([p.sigma for p in poses]),
             "reliable": np.array([p.reliable for p in poses]),
+            "risk": np.array([p.risk for p in poses]),
+            "doubts": np.array([p.doubt for p in poses], dtype=np.str_),
         }
         names = arrays["pose_stage_names"]
         arrays["pose_stage_ms"] = np.array([[p.stage_ms.get(str(s), np.nan) for s in names] for p in poses])
@@ -319,6 +321,9 @@ def load_frames(path: Path) -> tuple[FrameResult, ...]:
     data = read_npz(path)
     if "stamps_ns" in data:  # runs from before there were several people
         data.setdefault("numbers", np.ones(data["stamps_ns"].shape, np.int64))
+    if "reliable" in data and data["reliable"].dtype == bool:  # and from before it was told why a pose is not
+        data.setdefault("risk", np.where(data["reliable"], 0.0, 1.0))
+        data.setdefault("doubts", np.full(data["reliable"].shape, ""))
     try:
         _check_layout(data)
         return tuple(_frames(data))
@@ -336,7 +341,7 @@ _POSE_LAYOUT = {
     "flesh_parts": ("i", "G3"), "flesh_part_names": ("U", "G"), "joints": ("f", "PJ3"), "rotations": ("f", "PB33"),
     "angles": ("f", "PA"), "sizes": ("f", "PS"), "flesh_centres": ("f", "PC3"), "flesh_radii": ("f", "PC"),
     "parameters": ("f", "PV"), "energy": ("f", "P"), "sigma": ("f", "PJ"), "reliable": ("b", "P"),
-    "pose_stage_ms": ("f", "PU"),
+    "risk": ("f", "P"), "doubts": ("U", "P"), "pose_stage_ms": ("f", "PU"),
 }  # fmt: skip
 
 
@@ -402,6 +407,8 @@ def _pose(data: dict[str, NDArray[Any]], row: int) -> Pose:
         sigma=data["sigma"][row],
         reliable=bool(data["reliable"][row]),
         stage_ms=_times([str(s) for s in data["pose_stage_names"]], data["pose_stage_ms"][row]),
+        risk=float(data["risk"][row]),
+        doubt=str(data["doubts"][row]),
     )
 
 

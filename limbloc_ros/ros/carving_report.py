@@ -14,10 +14,10 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.node import Node
 
 from limbloc_ros.core.camera import Rig
+from limbloc_ros.core.confidence import CUT_M2
 from limbloc_ros.core.errors import NoPerson
 from limbloc_ros.core.hull import Hull
 from limbloc_ros.core.images import Pixels
-from limbloc_ros.core.pipeline import CUT_M2
 from limbloc_ros.core.synchroniser import FrameSet, StampSynchroniser, SyncCounters
 from limbloc_ros.rig.watch import ConsistencyWatch
 from limbloc_ros.ros.backlog import Backlog

@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: Apache-2.0
+"""When a pose is called reliable, and why not."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from limbloc_ros.core import confidence
+from limbloc_ros.core.confidence import DOUBTFUL, risk_of
+from limbloc_ros.core.figure import FigureState, place
+from limbloc_ros.core.hull import Hull
+from limbloc_ros.core.unexplained import Outlines
+
+BODY = place(FigureState.standing(np.array([0.0, 0.0, 0.95]))).flesh()
+SHOWN = np.full((2, 2), 0.4)
+
+
+@pytest.fixture(autouse=True)
+def depths(monkeypatch):
+    """How deep the forearms lie in other flesh, to be changed by tests."""
+    depths = np.array([-0.17, -0.17])
+    monkeypatch.setattr(confidence, "forearm_depths_m", lambda flesh: depths)
+    return depths
+
+
+def block(shape=(40, 40, 40), at=(0, 0, 0)) -> Hull:
+    """A hull that fills its grid but for the outermost voxels."""
+    sdf = np.full(shape, 0.06, np.float32)
+    sdf[3:-3, 3:-3, 3:-3] = -0.05
+    return Hull(0.02, at, sdf, 0.06)
+
+
+def asked(passed_m: float = 0.04, support=SHOWN, energy: float = 0.3, hull: Hull | None = None) -> str:
+    risk, sign = risk_of(hull or block(), BODY, energy, Outlines(passed_m, np.asarray(support)))
+    assert 0.0 <= risk <= 1.0
+    return sign if risk >= DOUBTFUL else ""
+
+
+def test_nothing_is_doubted_without_a_sign():
+    assert asked() == ""
+    assert risk_of(block(), BODY, 0.3, None) == (0.0, "")
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_an_arm_that_hardly_shows_is_named(side):
+    support = SHOWN.copy()
+    support[["left", "right"].index(side)] = 0.005, 0.02
+    assert asked(support=support) == f"the {side} arm hardly shows in the silhouettes"
+    assert asked(support=np.zeros((2, 2)))  # and where it does not show at all
+
+
+def test_what_the_figure_has_not_is_told_with_its_distance():
+    assert "something 20 cm beside the figure" in asked(passed_m=0.2)
+
+
+def test_each_sign_makes_a_pose_less_likely_right():
+    """Where one sign alone is not enough, two are."""
+    faint = SHOWN * [[1.0, 1.0], [0.2, 0.2]]
+    assert asked(support=faint) == "" and asked(passed_m=0.10) == ""
+    assert asked(support=faint, passed_m=0.10)
+
+
+def test_a_forearm_in_other_flesh_is_a_sign(depths):
+    faint = SHOWN * [[1.0, 1.0], [0.4, 0.4]]
+    assert asked(support=faint) == ""
+    depths[1] = 0.03
+    assert asked(support=faint) == "the right forearm lies close to other parts"
+    depths[:] = 0.03, -0.17
+    assert asked(support=faint) == "the left forearm lies close to other parts"
+
+
+def test_a_figure_of_no_such_hull_and_half_a_person():
+    assert "XOR energy 0.70" in asked(energy=0.70)
+    cut = block()
+    cut.sdf[-2, 3:-3, 3:-3] = -0.05  # up to the wall, and outside beyond it
+    assert "carve volume" in asked(hull=dataclasses.replace(cut, sdf=cut.sdf))
