@@ -18,7 +18,8 @@ import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import fuzz.binary_targets  # noqa: F401  (enters its targets)
+import fuzz.message_targets
+import fuzz.recording_targets  # noqa: F401  (they enter their targets)
 from fuzz.targets import CORPUS, TARGETS
 
 #: One input may take so long, s.

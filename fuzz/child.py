@@ -22,7 +22,8 @@ KERNELS = [
 ]
 
 with atheris.instrument_imports(include=["limbloc_ros"], exclude=[*KERNELS, "limbloc_ros.simulation._quaternions"]):
-    import fuzz.binary_targets  # noqa: F401  (enters its targets)
+    import fuzz.message_targets
+    import fuzz.recording_targets  # noqa: F401  (they enter their targets)
     from fuzz.targets import TARGETS, check
     from limbloc_ros import cli  # noqa: F401
     from limbloc_ros.commands import report  # noqa: F401

@@ -202,3 +202,22 @@ def packed_npz(**arrays: object) -> bytes:
     out = io.BytesIO()
     np.savez_compressed(out, **arrays)  # type: ignore[arg-type]
     return out.getvalue()
+
+
+def mutate_bytes(data: bytes, most: int, rng: random.Random) -> bytes:
+    """Cuts, and numbers of all sizes overwritten, as headers and lengths are."""
+    out = bytearray(data)
+    for _ in range(rng.choice((1, 1, 2, 4))):
+        at = rng.randrange(len(out)) if out else 0
+        kind = rng.randrange(5)
+        if kind == 0:
+            del out[at:]
+        elif kind == 1:
+            del out[at : at + rng.choice((1, 4, 64, 512))]
+        else:
+            form = rng.choice("BHIQ")
+            limit = 2 ** (8 * struct.calcsize(form))
+            value = rng.choice((0, 1, limit - 1, limit // 2, rng.randrange(limit), 10**9 % limit))
+            raw = struct.pack(f"<{form}", value)
+            out[at : at + len(raw)] = raw
+    return bytes(out[:most])

@@ -13,7 +13,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import fuzz.binary_targets  # noqa: F401  (enters its targets)
+import fuzz.message_targets
+import fuzz.recording_targets  # noqa: F401  (they enter their targets)
 from fuzz.inputs import npy_with_shape, packed_npz
 from fuzz.targets import CORPUS, TARGETS, check
 from limbloc_ros.core.config import BackgroundConfig, FitConfig, HullConfig, SyncConfig, from_mapping
