@@ -50,6 +50,7 @@ CORE_ORDER = (
     "lm",
     "energy",
     "paper_energy",
+    "directions",
     "anchors",
     "limb_search",
     "search",

@@ -12,6 +12,7 @@ import pytest
 from flesh_hulls import POSTURES, VOXEL, hull_where, person_in
 
 from limbloc_ros.core import search
+from limbloc_ros.core.directions import sphere_directions
 from limbloc_ros.core.figure import BONE, place
 from limbloc_ros.core.search import ARM, LEG, Medial, kernels, limb_kernels
 
@@ -100,7 +101,7 @@ def test_points_are_spread_out_greedily():
 
 
 def test_directions_cover_the_sphere_evenly():
-    directions = search.sphere_directions(100)
+    directions = sphere_directions(100)
     np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1)
     rng = np.random.default_rng(6)
     probes = rng.normal(size=(2000, 3))

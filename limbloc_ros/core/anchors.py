@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from limbloc_ros.core import _anchors_kernels as kernels
 from limbloc_ros.core._figure_kernels import exp_so3
+from limbloc_ros.core.directions import sphere_directions
 from limbloc_ros.core.figure import (
     BONE,
     N_SPHERES,
@@ -146,7 +147,7 @@ def find_heads(
     support = np.concatenate(
         [
             kernels.sphere_support(
-                grid.hull.sdf, grid.local(points - r * normals), r / voxel, even_directions(96), 1.1 * voxel
+                grid.hull.sdf, grid.local(points - r * normals), r / voxel, sphere_directions(96), 1.1 * voxel
             )
             for r in HEAD_RADII_M
         ]
@@ -312,19 +313,9 @@ def part_of(flesh: Flesh, names: tuple[str, ...]) -> Flesh:
     return Flesh(flesh.centres, flesh.radii, flesh.parts[keep], tuple(flesh.part_names[n] for n in keep))
 
 
-@cache
-def even_directions(count: int) -> Array:
-    """[count, 3] unit vectors spread evenly (a Fibonacci lattice)."""
-    n = np.arange(count) + 0.5
-    z = 1 - 2 * n / count
-    angle = np.pi * (1 + 5**0.5) * n
-    r = np.sqrt(1 - z * z)
-    return np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=1)
-
-
 def _orientations(axis: Array, headings: int, cone_rad: float = 1.22) -> Array:
     """[R, 3, 3] rotations whose z axis lies within a cone around `axis`, each with evenly spread headings."""
-    directions = even_directions(400)
+    directions = sphere_directions(400)
     z = directions[directions @ axis > np.cos(cone_rad)]
     other = np.where(np.abs(z[:, :1]) < 0.8, np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]))
     u = np.cross(z, other)

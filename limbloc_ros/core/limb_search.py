@@ -19,7 +19,8 @@ from scipy.spatial import cKDTree
 
 from limbloc_ros.core import _anchors_kernels as kernels
 from limbloc_ros.core._figure_kernels import exp_so3
-from limbloc_ros.core.anchors import Grid, Limb, even_directions
+from limbloc_ros.core.anchors import Grid, Limb
+from limbloc_ros.core.directions import sphere_directions
 from limbloc_ros.core.figure import BONE, N_SPHERES, PARENTS, SPHERE, FigureState, Placed, place, proportions
 from limbloc_ros.core.geodesic import Maxima
 from limbloc_ros.core.pose import JOINT
@@ -289,4 +290,4 @@ def _frustum_samples() -> Array:
 
 _NOTHING = np.zeros(4)
 FRUSTUM = _frustum_samples()
-_FAN = even_directions(200)
+_FAN = sphere_directions(200)

@@ -20,6 +20,7 @@ from limbloc_ros.core import _torso_kernels as torso_kernels
 from limbloc_ros.core import figure
 from limbloc_ros.core._figure_kernels import exp_so3
 from limbloc_ros.core._figure_topology import SPHERES
+from limbloc_ros.core.directions import sphere_directions
 from limbloc_ros.core.figure import BONE, SPHERE, FigureState, Placed
 from limbloc_ros.core.hull import Hull
 
@@ -221,16 +222,6 @@ def turned_about(state: FigureState) -> FigureState:
     core = [SPHERE[n] for n in ("iliac_L", "iliac_R", "waist_L", "waist_R", "ribs_L", "ribs_R")]
     shift = placed.spheres[core].mean(axis=0) - figure.place(turned).spheres[core].mean(axis=0)
     return FigureState(state.root + shift, rotations, state.shape)
-
-
-@cache
-def sphere_directions(count: int) -> Array:
-    """[count, 3] nearly uniform unit vectors (Fibonacci sphere)."""
-    i = np.arange(count) + 0.5
-    z = 1 - 2 * i / count
-    phi = i * math.pi * (3 - math.sqrt(5))
-    r = np.sqrt(1 - z * z)
-    return np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=1)
 
 
 @dataclass(frozen=True)
