@@ -10,10 +10,9 @@ from limbloc_ros.core import confidence
 from limbloc_ros.core.confidence import DOUBTFUL, risk_of
 from limbloc_ros.core.figure import FigureState, place
 from limbloc_ros.core.hull import Hull
-from limbloc_ros.core.unexplained import Outlines
 
 BODY = place(FigureState.standing(np.array([0.0, 0.0, 0.95]))).flesh()
-SHOWN = np.full((2, 2), 0.4)
+SHOWN = np.full((2, 2), 0.1)
 
 
 @pytest.fixture(autouse=True)
@@ -31,23 +30,23 @@ def block(shape=(40, 40, 40), at=(0, 0, 0)) -> Hull:
     return Hull(0.02, at, sdf, 0.06)
 
 
-def asked(passed_m: float = 0.04, support=SHOWN, energy: float = 0.3, hull: Hull | None = None) -> str:
-    risk, sign = risk_of(hull or block(), BODY, energy, Outlines(passed_m, np.asarray(support)))
+def asked(passed_m: float = 0.04, shown=SHOWN, energy: float = 0.3, hull: Hull | None = None) -> str:
+    risk, sign = risk_of(hull or block(), BODY, energy, np.asarray(shown), passed_m)
     assert 0.0 <= risk <= 1.0
     return sign if risk >= DOUBTFUL else ""
 
 
 def test_nothing_is_doubted_without_a_sign():
     assert asked() == ""
-    assert risk_of(block(), BODY, 0.3, None) == (0.0, "")
+    assert risk_of(block(), BODY, 0.3, None, 0.2) == (0.0, "")
 
 
 @pytest.mark.parametrize("side", ["left", "right"])
 def test_an_arm_that_hardly_shows_is_named(side):
-    support = SHOWN.copy()
-    support[["left", "right"].index(side)] = 0.005, 0.02
-    assert asked(support=support) == f"the {side} arm hardly shows in the silhouettes"
-    assert asked(support=np.zeros((2, 2)))  # and where it does not show at all
+    shown = SHOWN.copy()
+    shown[["left", "right"].index(side)] = 0.01, 0.02
+    assert asked(shown=shown) == f"the {side} arm hardly shows in the silhouettes"
+    assert asked(shown=np.zeros((2, 2)))  # and where it does not show at all
 
 
 def test_what_the_figure_has_not_is_told_with_its_distance():
@@ -56,18 +55,18 @@ def test_what_the_figure_has_not_is_told_with_its_distance():
 
 def test_each_sign_makes_a_pose_less_likely_right():
     """Where one sign alone is not enough, two are."""
-    faint = SHOWN * [[1.0, 1.0], [0.2, 0.2]]
-    assert asked(support=faint) == "" and asked(passed_m=0.10) == ""
-    assert asked(support=faint, passed_m=0.10)
+    faint = SHOWN * [[1.0, 1.0], [0.6, 0.6]]
+    assert asked(shown=faint) == "" and asked(passed_m=0.10) == ""
+    assert asked(shown=faint, passed_m=0.10)
 
 
 def test_a_forearm_in_other_flesh_is_a_sign(depths):
-    faint = SHOWN * [[1.0, 1.0], [0.4, 0.4]]
-    assert asked(support=faint) == ""
-    depths[1] = 0.03
-    assert asked(support=faint) == "the right forearm lies close to other parts"
-    depths[:] = 0.03, -0.17
-    assert asked(support=faint) == "the left forearm lies close to other parts"
+    faint = SHOWN * [[1.0, 1.0], [0.6, 0.6]]
+    assert asked(shown=faint) == ""
+    depths[1] = 0.08
+    assert asked(shown=faint) == "the right forearm lies close to other parts"
+    depths[:] = 0.08, -0.17
+    assert asked(shown=faint) == "the left forearm lies close to other parts"
 
 
 def test_a_figure_of_no_such_hull_and_half_a_person():

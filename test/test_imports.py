@@ -61,6 +61,7 @@ CORE_ORDER = (
     "joint_angles",
     "ros4hri",
     "unexplained",
+    "shown",
     "confidence",
     "pipeline",
     "parts",

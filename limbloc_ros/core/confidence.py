@@ -16,8 +16,9 @@ from limbloc_ros.core.hull import Hull
 from limbloc_ros.core.joint_angles import native_angles
 from limbloc_ros.core.lm import System
 from limbloc_ros.core.pose import JOINT, JOINT_NAMES, STICK_BONES, Flesh, Pose
+from limbloc_ros.core.shown import SIDES, arms_shown, forearm_depths_m
 from limbloc_ros.core.surface import Surface
-from limbloc_ros.core.unexplained import SIDES, Outlines, forearm_depths_m, meet_outlines
+from limbloc_ros.core.unexplained import unexplained_m
 
 Array = NDArray[np.float64]
 Rivals = Sequence[tuple[FigureState, float]]
@@ -28,18 +29,18 @@ CUT_M2 = 0.02
 NO_MATCH_XOR = 0.62
 #: The chance that some joint of the limbs is 15 cm off from which on a pose is not to be acted on. Its log-odds are
 #: those of a figure without any sign of that, and what is added for each sign (`risk_of`):
-#: - the less an arm adds to the explanation of the outlines: the logarithms of what upper arm and forearm do, of the
-#:   arm that shows less. It is little where masks are ragged, or the arm is before the trunk;
+#: - the less an arm shows: the logarithms of what only the upper arm and only the forearm explain of the silhouettes
+#:   (`shown.arms_shown`), of the arm that shows less;
 #: - per m by which an outline passes the figure: the silhouettes show something that it has not;
 #: - per m that a forearm lies in other flesh: the further it is away from the rest of the body, the less is in doubt.
-#: From 850 frames of other people, poses and cameras than the public suites have, and 1,550 of simulated rooms, by
-#: logistic regression; rounded, for what they are fitted to will go on changing.
-DOUBTFUL = 0.08
-USUAL_LOG_ODDS, PER_LOG_SUPPORT, PER_M_PASSED, PER_M_DEEP = -6.1, 1.0, 35.0, 15.0
+#: By logistic regression from 850 frames of other people, poses and cameras than the public suites have, and 1,550 of
+#: simulated rooms; rounded, for what they are fitted to goes on changing.
+DOUBTFUL = 0.065
+USUAL_LOG_ODDS, PER_LOG_SHOWN, PER_M_PASSED, PER_M_DEEP = -6.0, 1.9, 42.0, 10.0
 #: What these signs are when nothing is wrong; the one that is furthest above that is named.
-USUAL_LOG_SUPPORT, USUAL_PASSED_M, USUAL_DEPTH_M = -1.8, 0.05, -0.17
-#: Less support than this is none.
-LEAST_SUPPORT = 0.003
+USUAL_LOG_SHOWN, USUAL_PASSED_M, USUAL_DEPTH_M = -4.7, 0.05, -0.17
+#: What shows less than this does not show.
+LEAST_SHOWN = 0.003
 #: Error that remains where nothing is in doubt, m; how far the energy's curvature is believed; by how much the energy
 #: of a rival (as a fraction of the least) may be above that before it hardly counts.
 FLOOR_M, BELIEF, RIVAL_WIDTH = 0.010, 0.015, 0.08
@@ -66,14 +67,15 @@ def joint_sigma(state: FigureState, system: System, rivals: Rivals = ()) -> Arra
     return np.asarray(np.sqrt(FLOOR_M**2 + BELIEF * system.cost * curved + apart / weight))
 
 
-def risk_of(hull: Hull, flesh: Flesh, energy: float, outlines: Outlines | None) -> tuple[float, str]:
+def risk_of(hull: Hull, flesh: Flesh, energy: float, shown: Array | None, passed_m: float) -> tuple[float, str]:
     """How likely a figure is wrong, and what says so.
 
     Args:
         hull: what it was fitted to.
         flesh: of the figure.
         energy: its XOR energy.
-        outlines: how the silhouettes' outlines meet it, if that is known.
+        shown: [2, 2] how much its arms show (`shown.arms_shown`), if that is known.
+        passed_m: how far the silhouettes' outlines pass it (`unexplained.unexplained_m`).
 
     Returns:
         the chance, 0 to 1, that a joint of its limbs is 15 cm off, and the strongest sign of that in a few words.
@@ -82,20 +84,20 @@ def risk_of(hull: Hull, flesh: Flesh, energy: float, outlines: Outlines | None) 
         return 1.0, "the person reaches out of the carve volume"
     if energy >= NO_MATCH_XOR:
         return 1.0, f"the figure does not match the hull: XOR energy {energy:.2f}"
-    if outlines is None:
+    if shown is None:
         return 0.0, ""
-    shown = np.log(np.maximum(outlines.support, LEAST_SUPPORT)).sum(axis=1)
+    log_shown = np.log(np.maximum(shown, LEAST_SHOWN)).sum(axis=1)
     depths = forearm_depths_m(flesh)
-    hidden, deep = int(shown.argmin()), int(depths.argmax())
-    log_odds = {
-        f"the {SIDES[hidden]} arm hardly shows in the silhouettes": PER_LOG_SUPPORT
-        * (USUAL_LOG_SUPPORT - float(shown[hidden])),
-        f"the silhouettes show something {100 * outlines.passed_m:.0f} cm beside the figure": PER_M_PASSED
-        * (outlines.passed_m - USUAL_PASSED_M),
+    hidden, deep = int(log_shown.argmin()), int(depths.argmax())
+    signs = {
+        f"the {SIDES[hidden]} arm hardly shows in the silhouettes": PER_LOG_SHOWN
+        * (USUAL_LOG_SHOWN - float(log_shown[hidden])),
+        f"the silhouettes show something {100 * passed_m:.0f} cm beside the figure": PER_M_PASSED
+        * (passed_m - USUAL_PASSED_M),
         f"the {SIDES[deep]} forearm lies close to other parts": PER_M_DEEP * (float(depths[deep]) - USUAL_DEPTH_M),
     }
-    risk = 1.0 / (1.0 + math.exp(-USUAL_LOG_ODDS - sum(log_odds.values())))
-    return risk, max(log_odds, key=log_odds.__getitem__)
+    risk = 1.0 / (1.0 + math.exp(-USUAL_LOG_ODDS - sum(signs.values())))
+    return risk, max(signs, key=signs.__getitem__)
 
 
 def describe_pose(
@@ -115,7 +117,7 @@ def describe_pose(
         system: the smooth energy around the fit, if the engine has one.
         stage_ms: process time of the stages so far, ms.
         rivals: figures that explain the hull nearly as well, with their energy over the least.
-        surface: the hull's; without it the outlines of the silhouettes are not asked whether the pose is reliable.
+        surface: the hull's; without it the silhouettes are not asked whether the pose is reliable.
         others: where other people are; what they explain of the outlines, this figure need not.
     """
     placed = figure.place(state)
@@ -126,8 +128,9 @@ def describe_pose(
         f"{a}-{b}": float(np.linalg.norm(placed.joints[JOINT[a]] - placed.joints[JOINT[b]])) for a, b in STICK_BONES
     }
     sizes["stature"] = float(np.exp(state.shape[0]))
-    outlines = None if surface is None else meet_outlines(hull, surface, flesh, others)
-    risk, sign = risk_of(hull, flesh, energy, outlines)
+    shown = None if surface is None else arms_shown(hull, surface, flesh)
+    passed_m = 0.0 if surface is None else unexplained_m(hull, surface, flesh, others)
+    risk, sign = risk_of(hull, flesh, energy, shown, passed_m)
     return Pose(
         joints=placed.joints,
         rotations=placed.rotations,
