@@ -12,7 +12,7 @@ from limbloc_ros.core.figure import FigureState, place
 from limbloc_ros.core.hull import Hull
 
 BODY = place(FigureState.standing(np.array([0.0, 0.0, 0.95]))).flesh()
-SHOWN = np.full((2, 2), 0.1)
+SHOWN = np.array([[0.1, 0.1, 0.35], [0.1, 0.1, 0.35]])
 
 
 @pytest.fixture(autouse=True)
@@ -44,9 +44,16 @@ def test_nothing_is_doubted_without_a_sign():
 @pytest.mark.parametrize("side", ["left", "right"])
 def test_an_arm_that_hardly_shows_is_named(side):
     shown = SHOWN.copy()
-    shown[["left", "right"].index(side)] = 0.01, 0.02
+    shown[["left", "right"].index(side), :2] = 0.01, 0.02
     assert asked(shown=shown) == f"the {side} arm hardly shows in the silhouettes"
-    assert asked(shown=np.zeros((2, 2)))  # and where it does not show at all
+    assert asked(shown=np.zeros((2, 3)))  # and where it does not show at all
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_a_leg_that_hardly_shows_is_named(side):
+    shown = SHOWN.copy()
+    shown[["left", "right"].index(side), 2] = 0.02
+    assert asked(shown=shown) == f"the {side} leg hardly shows in the silhouettes"
 
 
 def test_what_the_figure_has_not_is_told_with_its_distance():
@@ -55,13 +62,13 @@ def test_what_the_figure_has_not_is_told_with_its_distance():
 
 def test_each_sign_makes_a_pose_less_likely_right():
     """Where one sign alone is not enough, two are."""
-    faint = SHOWN * [[1.0, 1.0], [0.6, 0.6]]
+    faint = SHOWN * [[1.0, 1.0, 1.0], [0.6, 0.6, 1.0]]
     assert asked(shown=faint) == "" and asked(passed_m=0.10) == ""
     assert asked(shown=faint, passed_m=0.10)
 
 
 def test_a_forearm_in_other_flesh_is_a_sign(depths):
-    faint = SHOWN * [[1.0, 1.0], [0.6, 0.6]]
+    faint = SHOWN * [[1.0, 1.0, 1.0], [0.6, 0.6, 1.0]]
     assert asked(shown=faint) == ""
     depths[1] = 0.08
     assert asked(shown=faint) == "the right forearm lies close to other parts"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What only the arms explain of the silhouettes, arms in other flesh, and what both say of a pose."""
+"""What only the limbs explain of the silhouettes, arms in other flesh, and what both say of a pose."""
 
 import dataclasses
 from pathlib import Path
@@ -13,7 +13,7 @@ from limbloc_ros.core.confidence import describe_pose
 from limbloc_ros.core.figure import BONE, PART_SPHERES, FigureState, flesh_distance
 from limbloc_ros.core.pipeline import Carver, PoseEstimator
 from limbloc_ros.core.search import turned_about
-from limbloc_ros.core.shown import arms_shown, forearm_depths_m
+from limbloc_ros.core.shown import forearm_depths_m, limbs_shown
 from limbloc_ros.core.surface import extract_surface
 from limbloc_ros.recordings.cases import load_case
 
@@ -111,23 +111,35 @@ def test_a_camera_that_looks_at_the_middle(viewpoint):
     np.testing.assert_allclose(np.cross(axes[2], np.array([0.0, 0.0, 1.0]) - viewpoint), 0.0, atol=1e-12)
 
 
-def test_a_good_fit_is_reliable_and_its_arms_show(walking):
+def test_a_good_fit_is_reliable_and_its_limbs_show(walking):
     hull, surface, pose = walking
     assert pose.reliable and not pose.doubt and pose.risk < 0.03
-    assert (arms_shown(hull, surface, pose.flesh) > 0.05).all()
+    assert (limbs_shown(hull, surface, pose.flesh) > 0.05).all()
 
 
 @pytest.mark.parametrize("side", [LEFT, RIGHT])
 def test_an_arm_in_the_trunk_shows_nowhere_and_the_pose_is_not_reliable(walking, side):
     hull, surface, pose = walking
     wrong = described(arm_in_the_trunk(pose, side), walking)
-    shown = arms_shown(hull, surface, wrong.flesh)
-    assert shown[side].min() < 0.01 < 0.03 < shown[1 - side].min()
+    shown = limbs_shown(hull, surface, wrong.flesh)
+    assert shown[side, :2].min() < 0.01 < 0.03 < shown[1 - side].min()
     depths, right = forearm_depths_m(wrong.flesh), forearm_depths_m(pose.flesh)
     assert depths[side] > 0.0 > right[side]
     assert depths[1 - side] == right[1 - side]
     assert not wrong.reliable and wrong.risk > 0.9
     assert wrong.doubt == f"the {('left', 'right')[side]} arm hardly shows in the silhouettes"
+
+
+@pytest.mark.parametrize("side", [LEFT, RIGHT])
+def test_a_leg_that_is_folded_away_is_not_reliable(walking, side):
+    """As when the hull has lost it."""
+    hull, surface, pose = walking
+    state = FigureState.from_vector(pose.parameters)
+    state.rotations[BONE[f"thigh_{'LR'[side]}"]] = exp_so3(np.radians([0.0, -60.0, 0.0]))
+    state.rotations[BONE[f"shin_{'LR'[side]}"]] = exp_so3(np.radians([0.0, 165.0, 0.0]))
+    wrong = described(state, walking)
+    assert limbs_shown(hull, surface, wrong.flesh)[side, 2] < 0.3 * limbs_shown(hull, surface, pose.flesh)[side, 2]
+    assert not wrong.reliable
 
 
 def test_an_arm_in_the_air_is_not_reliable(walking):
@@ -142,8 +154,8 @@ def test_a_figure_that_looks_the_other_way_is_not_reliable(walking):
     assert not described(state, walking).reliable
 
 
-def test_where_nobody_knows_the_cameras_arms_are_not_asked(walking):
+def test_where_nobody_knows_the_cameras_limbs_are_not_asked(walking):
     hull, surface, pose = walking
     unknown = dataclasses.replace(hull, cut_by=None, viewpoints=hull.viewpoints[:0])
-    assert arms_shown(unknown, surface, pose.flesh) is None
+    assert limbs_shown(unknown, surface, pose.flesh) is None
     assert describe_pose(arm_in_the_trunk(pose, LEFT), unknown, None, {}, surface=surface).reliable

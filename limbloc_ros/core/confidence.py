@@ -16,7 +16,7 @@ from limbloc_ros.core.hull import Hull
 from limbloc_ros.core.joint_angles import native_angles
 from limbloc_ros.core.lm import System
 from limbloc_ros.core.pose import JOINT, JOINT_NAMES, STICK_BONES, Flesh, Pose
-from limbloc_ros.core.shown import SIDES, arms_shown, forearm_depths_m
+from limbloc_ros.core.shown import SIDES, forearm_depths_m, limbs_shown
 from limbloc_ros.core.surface import Surface
 from limbloc_ros.core.unexplained import unexplained_m
 
@@ -30,15 +30,17 @@ NO_MATCH_XOR = 0.62
 #: The chance that some joint of the limbs is 15 cm off from which on a pose is not to be acted on. Its log-odds are
 #: those of a figure without any sign of that, and what is added for each sign (`risk_of`):
 #: - the less an arm shows: the logarithms of what only the upper arm and only the forearm explain of the silhouettes
-#:   (`shown.arms_shown`), of the arm that shows less;
+#:   (`shown.limbs_shown`), of the arm that shows less;
+#: - the less a shin shows, likewise;
 #: - per m by which an outline passes the figure: the silhouettes show something that it has not;
 #: - per m that a forearm lies in other flesh: the further it is away from the rest of the body, the less is in doubt.
 #: By logistic regression from 850 frames of other people, poses and cameras than the public suites have, and 1,550 of
 #: simulated rooms; rounded, for what they are fitted to goes on changing.
-DOUBTFUL = 0.065
-USUAL_LOG_ODDS, PER_LOG_SHOWN, PER_M_PASSED, PER_M_DEEP = -6.0, 1.9, 42.0, 10.0
+DOUBTFUL = 0.09
+USUAL_LOG_ODDS = -6.0
+PER_LOG_ARM, PER_LOG_SHIN, PER_M_PASSED, PER_M_DEEP = 1.9, 1.5, 42.0, 10.0
 #: What these signs are when nothing is wrong; the one that is furthest above that is named.
-USUAL_LOG_SHOWN, USUAL_PASSED_M, USUAL_DEPTH_M = -4.7, 0.05, -0.17
+USUAL_LOG_ARM, USUAL_LOG_SHIN, USUAL_PASSED_M, USUAL_DEPTH_M = -4.7, -1.05, 0.05, -0.17
 #: What shows less than this does not show.
 LEAST_SHOWN = 0.003
 #: Error that remains where nothing is in doubt, m; how far the energy's curvature is believed; by how much the energy
@@ -74,7 +76,7 @@ def risk_of(hull: Hull, flesh: Flesh, energy: float, shown: Array | None, passed
         hull: what it was fitted to.
         flesh: of the figure.
         energy: its XOR energy.
-        shown: [2, 2] how much its arms show (`shown.arms_shown`), if that is known.
+        shown: [2, 3] how much its limbs show (`shown.limbs_shown`), if that is known.
         passed_m: how far the silhouettes' outlines pass it (`unexplained.unexplained_m`).
 
     Returns:
@@ -86,12 +88,12 @@ def risk_of(hull: Hull, flesh: Flesh, energy: float, shown: Array | None, passed
         return 1.0, f"the figure does not match the hull: XOR energy {energy:.2f}"
     if shown is None:
         return 0.0, ""
-    log_shown = np.log(np.maximum(shown, LEAST_SHOWN)).sum(axis=1)
-    depths = forearm_depths_m(flesh)
-    hidden, deep = int(log_shown.argmin()), int(depths.argmax())
+    log_shown = np.log(np.maximum(shown, LEAST_SHOWN))
+    arms, shins, depths = log_shown[:, :2].sum(axis=1), log_shown[:, 2], forearm_depths_m(flesh)
+    arm, leg, deep = int(arms.argmin()), int(shins.argmin()), int(depths.argmax())
     signs = {
-        f"the {SIDES[hidden]} arm hardly shows in the silhouettes": PER_LOG_SHOWN
-        * (USUAL_LOG_SHOWN - float(log_shown[hidden])),
+        f"the {SIDES[arm]} arm hardly shows in the silhouettes": PER_LOG_ARM * (USUAL_LOG_ARM - float(arms[arm])),
+        f"the {SIDES[leg]} leg hardly shows in the silhouettes": PER_LOG_SHIN * (USUAL_LOG_SHIN - float(shins[leg])),
         f"the silhouettes show something {100 * passed_m:.0f} cm beside the figure": PER_M_PASSED
         * (passed_m - USUAL_PASSED_M),
         f"the {SIDES[deep]} forearm lies close to other parts": PER_M_DEEP * (float(depths[deep]) - USUAL_DEPTH_M),
@@ -128,7 +130,7 @@ def describe_pose(
         f"{a}-{b}": float(np.linalg.norm(placed.joints[JOINT[a]] - placed.joints[JOINT[b]])) for a, b in STICK_BONES
     }
     sizes["stature"] = float(np.exp(state.shape[0]))
-    shown = None if surface is None else arms_shown(hull, surface, flesh)
+    shown = None if surface is None else limbs_shown(hull, surface, flesh)
     passed_m = 0.0 if surface is None else unexplained_m(hull, surface, flesh, others)
     risk, sign = risk_of(hull, flesh, energy, shown, passed_m)
     return Pose(

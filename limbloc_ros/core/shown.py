@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether arms show: how much of the silhouettes nothing else explains, and whether they lie in other flesh.
+"""Whether limbs show: how much of the silhouettes nothing else explains, and whether arms lie in other flesh.
 
 An arm that shows nowhere may as well be elsewhere: before the trunk, in its flesh, or where a ragged mask has lost it,
-it hardly changes how well a figure matches its hull. So it is asked what the cameras see of each arm that they see of
-nothing else, and that is held against what figure and hull do not share there: the noise of the masks, clothes, and
-limbs in wrong places.
+it hardly changes how well a figure matches its hull. A leg that the hull has lost is folded into the other flesh. So it
+is asked what the cameras see of each limb that they see of nothing else, and that is held against what figure and hull
+do not share there: the noise of the masks, clothes, and limbs in wrong places.
 """
 
 from __future__ import annotations
@@ -29,30 +29,31 @@ MARGIN_M = 0.3
 SIDES = ("left", "right")
 _REST = 0
 _GROUPS = {
-    "upper_arm_L": 1, "forearm_L": 2, "hand_L": 2,
-    "upper_arm_R": 3, "forearm_R": 4, "hand_R": 4,
+    "upper_arm_L": 1, "forearm_L": 2, "hand_L": 2, "shin_L": 3, "foot_L": 3,
+    "upper_arm_R": 4, "forearm_R": 5, "hand_R": 5, "shin_R": 6, "foot_R": 6,
 }  # fmt: skip
 _GROUP_OF_PART = np.array([_GROUPS.get(name, _REST) for name in PART_NAMES])
-_COUNT = 5
+_COUNT = 7
+_GIRDLES = ("girdle_L", "girdle_R")
 _FOREARMS = np.array([[SPHERE[f"{name}_{side}"] for name in ("bulge", "wrist")] for side in "LR"])
 #: All parts but one arm and the girdles, which hold the shoulders on.
 _BUT_THIS_ARM = [
-    np.array([not (name in _GROUPS and name.endswith(side)) and not name.startswith("girdle") for name in PART_NAMES])
+    np.array([name not in (f"upper_arm_{side}", f"forearm_{side}", f"hand_{side}", *_GIRDLES) for name in PART_NAMES])
     for side in "LR"
 ]
 
 
-def arms_shown(hull: Hull, surface: Surface, flesh: Flesh) -> Array | None:
-    """What only the arms explain of the silhouettes.
+def limbs_shown(hull: Hull, surface: Surface, flesh: Flesh) -> Array | None:
+    """What only the limbs explain of the silhouettes.
 
     Args:
         hull, surface: what the figure was fitted to.
         flesh: of the figure.
 
     Returns:
-        [2, 2] of the left and the right arm (SIDES), the area that only the upper arm covers in the hull's silhouettes,
-        and that only forearm and hand do, summed over all cameras, over the area that figure and hull do not share;
-        usually a tenth. None where nobody knows where the cameras are.
+        [2, 3] of the left and the right side (SIDES), the area of the hull's silhouettes that only the upper arm
+        covers, that only forearm and hand do, and that only shin and foot do, summed over all cameras, over the area
+        that figure and hull do not share: usually 0.1, 0.1 and 0.35. None where nobody knows where the cameras are.
     """
     if len(hull.viewpoints) == 0:
         return None
@@ -61,7 +62,7 @@ def arms_shown(hull: Hull, surface: Surface, flesh: Flesh) -> Array | None:
         surface.points, np.array(hull.viewpoints, np.float64), PART_SPHERES, _GROUP_OF_PART, flesh.centres, flesh.radii,
         _COUNT, cell, round(MARGIN_M / cell),
     )  # fmt: skip
-    return np.asarray(cells[1:_COUNT].reshape(2, 2) / max(int(cells[_COUNT]), 1))
+    return np.asarray(cells[1:_COUNT].reshape(2, 3) / max(int(cells[_COUNT]), 1))
 
 
 def forearm_depths_m(flesh: Flesh) -> Array:
