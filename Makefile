@@ -24,7 +24,7 @@ help:
 
 setup: $(STAMP)
 
-$(STAMP): setup.py setup.cfg pyproject.toml requirements/$(ROS).lock tools/setup_venv.sh
+$(STAMP): setup.py setup.cfg pyproject.toml requirements/$(ROS).lock tools/setup_venv.sh tools/build_tf2_msgs.py
 	@bash tools/setup_venv.sh "$(VENV)" "$(ROS)"
 	@touch "$(STAMP)"
 

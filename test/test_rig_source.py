@@ -7,6 +7,8 @@ see that the node says what is missing.
 
 from __future__ import annotations
 
+import os
+import re
 import shutil
 import subprocess
 import sys
@@ -53,6 +55,22 @@ def message(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
         sys.path.remove(folder)
         for name in [name for name in sys.modules if name.split(".")[0] == "tf2_msgs"]:
             del sys.modules[name]
+
+
+def test_a_build_that_fails_leaves_nothing_behind(tmp_path: Path) -> None:
+    """`make setup` goes on without TF then; half a package would break every node."""
+    compiler = tmp_path / "bin" / "gcc"
+    compiler.parent.mkdir()
+    compiler.write_text("#!/bin/sh\nexit 1\n")
+    compiler.chmod(0o755)
+    where = tmp_path / "packages"
+    path = {**os.environ, "PATH": f"{compiler.parent}:/nowhere"}
+    run = subprocess.run([sys.executable, str(TOOL), str(where)], env=path, capture_output=True, text=True)
+    assert run.returncode == 1
+    assert run.stderr.splitlines()[-1].startswith("build_tf2_msgs: g")
+    assert list(where.iterdir()) == []
+    setup = (TOOL.parent / "setup_venv.sh").read_text()
+    assert re.search(r"^if built=.*build_tf2_msgs\.py 2>&1\); then$", setup, re.MULTILINE)
 
 
 @pytest.fixture(scope="module")

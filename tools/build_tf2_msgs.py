@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 import sysconfig
@@ -132,13 +133,29 @@ def run(command: list[str]) -> None:
         raise SystemExit(f"build_tf2_msgs: {command[0]} failed; is python3-dev installed?") from None
 
 
+#: What a node does with the message, in a process of its own.
+TRIAL = """
+from geometry_msgs.msg import TransformStamped
+from rclpy.serialization import deserialize_message, serialize_message
+from tf2_msgs.msg import TFMessage
+sent = TFMessage(transforms=[TransformStamped(child_frame_id="camera")])
+assert deserialize_message(serialize_message(sent), TFMessage) == sent
+"""
+
+
 def main() -> None:
-    """Build and install."""
-    package = Path(sys.argv[1] if len(sys.argv) > 1 else sysconfig.get_path("purelib")).resolve() / PACKAGE
-    with tempfile.TemporaryDirectory() as folder:
-        generate(Path(folder), package)
-        build(Path(folder), package)
-    print(f"{package} is built")
+    """Build, try, and only then install: half a package would be worse than none."""
+    where = Path(sys.argv[1] if len(sys.argv) > 1 else sysconfig.get_path("purelib")).resolve()
+    where.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=f".{PACKAGE}_", dir=where) as folder:
+        work, package = Path(folder) / "work", Path(folder) / PACKAGE
+        generate(work, package)
+        build(work, package)
+        if subprocess.run([sys.executable, "-c", TRIAL], env={**os.environ, "PYTHONPATH": folder}).returncode:
+            raise SystemExit("build_tf2_msgs: the message that was built does not work; nothing was installed")
+        shutil.rmtree(where / PACKAGE, ignore_errors=True)
+        package.rename(where / PACKAGE)
+    print(f"{where / PACKAGE} is built")
 
 
 if __name__ == "__main__":

@@ -64,4 +64,11 @@ pip=("$venv/bin/python" -m pip install -qq --disable-pip-version-check)
 "${pip[@]}" --require-hashes -r "requirements/$ros.lock"
 "${pip[@]}" --no-deps --no-build-isolation -e .
 "$venv/bin/python" -c 'import cv2, numba, rclpy' || die "the installed packages cannot be imported; remove $venv and try again"
+# /tf: the wheels lack its message. Nothing else needs that, so that no failure here ends the setup.
+if built=$("$venv/bin/python" tools/build_tf2_msgs.py 2>&1); then
+  say "setup: TF is there: ${built##*$'\n'}"
+else
+  say "setup: there will be no /tf; everything else works. ${built##*$'\n'}"
+  say "setup: try again with   $venv/bin/python tools/build_tf2_msgs.py"
+fi
 say "setup: done"
