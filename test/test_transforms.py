@@ -102,6 +102,13 @@ def test_the_newest_place_counts(tree: TransformTree) -> None:
     np.testing.assert_allclose(tree.find("room", "cam1"), shift(0.0, 2.0, 1.1))
 
 
+def test_a_slash_before_a_name_means_nothing(tree: TransformTree) -> None:
+    """Programs that come from ROS 1 write it; tf2 strips it, too."""
+    tree.set("/room", "/cam7", np.eye(4))
+    for parent, child in (("room", "cam7"), ("/room", "/cam7")):
+        np.testing.assert_array_equal(tree.find(parent, child), np.eye(4))
+
+
 def test_what_is_not_known_is_explained(tree: TransformTree) -> None:
     with pytest.raises(RigError, match="nobody publishes a frame 'cam7'; there is arm, base, cam0, cam1, ceiling"):
         tree.find("room", "cam7")
