@@ -80,13 +80,14 @@ def publishers_of(graph, topic):
 
 
 def messages_of_a_person(graph, hull, wanted):
-    """The first message of each topic after a hull was sent."""
+    """A message of each topic that tells of a person, whose hull is sent."""
     found = {name: graph.collect(message_class(publishers_of(graph, name)[0].topic_type), name) for name in wanted}
     publisher = graph.publisher(PointCloud2, topics.HULL)
-    graph.until(lambda: all(graph.tester.count_subscribers(name) > 0 for name in wanted))
-    graph.spin(0.2)
-    publisher.publish(hull_to_cloud(hull, make_header(10**12, "room")))
-    graph.until(lambda: all(any(complete(msg) for msg in messages) for messages in found.values()))
+    for n in range(60):  # the surface is worked out only once the subscription has been seen
+        publisher.publish(hull_to_cloud(hull, make_header((10 + n) * 10**11, "room")))
+        graph.spin(0.3)
+        if all(any(map(complete, messages)) for messages in found.values()):
+            break
     return {name: next(filter(complete, messages)) for name, messages in found.items()}
 
 
