@@ -5,9 +5,13 @@
     ros2 launch limbloc_ros smart_space.launch.py source:=cameras rig:=lab.yaml cameras:=cam0,cam1,cam2 rviz:=true
     ros2 launch limbloc_ros smart_space.launch.py source:=bag bag:=run1 rig:=lab.yaml
 
-`config:=my_room.yaml` gives your own copy of config/smart_space.yaml, which holds every other parameter.
+`config:=my_room.yaml` gives your own copy of config/smart_space.yaml, which holds every other parameter;
+`set:="pose.fit.engine=paper network.domain_id=42"` sets some of them, as `--set` of `smart_space` does.
 """
 
+import argparse
+import os
+import shlex
 import tempfile
 from pathlib import Path
 
@@ -25,9 +29,10 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
 from launch import LaunchDescription
-from limbloc_ros.nodes.graph_plan import load_config, plan_graph
+from limbloc_ros.nodes.graph_plan import plan_graph
+from limbloc_ros.nodes.smart_space import config_from_arguments
 from limbloc_ros.ros.environment import config_file, graph_environment
-from limbloc_ros.ros.supervisor import REFUSED
+from limbloc_ros.ros.supervisor import REFUSED, enclave_of
 
 ARGUMENTS = {
     "config": ("", "smart space file; empty: the installed config/smart_space.yaml"),
@@ -36,9 +41,11 @@ ARGUMENTS = {
     "bag": ("", "recording to replay"),
     "cameras": ("", "only these cameras of the rig, separated by commas"),
     "record": ("", "record the run to this new folder"),
-    "foxglove": ("false", "serve the graph to Foxglove too: true or false"),
+    "foxglove": ("false", "serve the graph to Foxglove too: true, false, or the port"),
+    "set": ("", "any values of the file: KEY=VALUE, several separated by spaces"),
     "rviz": ("false", "start RViz too: true or false"),
 }
+YES = ("true", "1", "yes")
 
 
 def when_over(plan):
@@ -57,14 +64,11 @@ def when_over(plan):
 def start(context):
     """Read the file with the arguments on top, and start one process per entry of the plan."""
     given = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
-    overrides = {name: given[name] for name in ("source", "rig", "bag") if given[name]}
-    if given["record"]:
-        overrides["record_to"] = given["record"]
-    if given["cameras"]:
-        overrides["cameras"] = [name.strip() for name in given["cameras"].split(",") if name.strip()]
-    if given["foxglove"].lower() in ("true", "1", "yes"):
-        overrides["foxglove"] = True
-    config = load_config(given["config"] or config_file("smart_space.yaml"), overrides)
+    foxglove = given["foxglove"].lower()
+    port = int(foxglove) if foxglove.isdigit() and foxglove not in ("0", "1") else 0
+    options = {name: given[name] or None for name in ("config", "source", "rig", "bag", "cameras", "record")}
+    options["foxglove"] = port if port or foxglove in YES else None
+    config = config_from_arguments(argparse.Namespace(**options, set=shlex.split(given["set"])))
     folder = tempfile.TemporaryDirectory(prefix="limbloc_")
     plans = plan_graph(config, Path(folder.name))
 
@@ -77,6 +81,7 @@ def start(context):
             executable="composed",
             exec_name=plan.name,
             arguments=[plan.description],
+            additional_env=enclave_of(plan.name, os.environ),
             output="screen",
             respawn=not finite,
             respawn_delay=config.processes.restart_delay_s,
@@ -85,7 +90,7 @@ def start(context):
         )
         actions.append(process)
         actions.append(RegisterEventHandler(OnProcessExit(target_action=process, on_exit=when_over(plan))))
-    if given["rviz"].lower() in ("true", "1", "yes"):
+    if given["rviz"].lower() in YES:
         actions.append(
             Node(package="rviz2", executable="rviz2", arguments=["-d", str(config_file("limbloc.rviz"))], output="log")
         )

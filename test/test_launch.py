@@ -4,7 +4,12 @@
 The launch file starts what `plan_graph` says; test_smart_space.py runs those plans for real.
 """
 
+import argparse
 import ast
+import re
+import runpy
+import sys
+import types
 import xml.etree.ElementTree as ET
 from dataclasses import fields
 from pathlib import Path
@@ -12,10 +17,11 @@ from pathlib import Path
 import pytest
 
 import limbloc_ros
+from limbloc_ros.nodes import smart_space
 from limbloc_ros.nodes.composed import KINDS, flatten
-from limbloc_ros.nodes.graph_plan import NODE_SECTIONS, SmartSpaceConfig
+from limbloc_ros.nodes.graph_plan import NODE_SECTIONS, SmartSpaceConfig, plan_graph
 from limbloc_ros.rig.rig_file import load_rig
-from limbloc_ros.ros.environment import share_folder
+from limbloc_ros.ros.environment import graph_environment, share_folder
 
 ROOT = Path(limbloc_ros.__file__).parent.parent
 LAUNCH = ROOT / "launch" / "smart_space.launch.py"
@@ -39,8 +45,80 @@ def test_launch_arguments_are_keys_of_the_config():
     known = {field.name for field in fields(SmartSpaceConfig)}
     arguments = launch_arguments()
     assert {"source", "rig", "bag", "cameras"} <= set(arguments)
-    assert set(arguments) - {"config", "rviz", "record"} <= known
+    assert set(arguments) - {"config", "rviz", "record", "set"} <= known
     assert all(len(text) > 5 for _, text in arguments.values())
+
+
+class Stand:
+    """In the place of ROS 2's launch: keeps what it is made of."""
+
+    def __init__(self, *args, **options):
+        self.args, self.options = args, options
+
+    def perform(self, context):
+        return context[self.args[0]]
+
+
+@pytest.fixture
+def launched(monkeypatch):
+    """Arguments of the launch file -> the actions that it gives to launch."""
+    names = {"launch": ["LaunchDescription"], "launch.actions": [], "launch.event_handlers": [], "launch.events": []}
+    for module in (*names, "launch.substitutions", "launch_ros", "launch_ros.actions"):
+        made = types.ModuleType(module)
+        for node in ast.walk(ast.parse(LAUNCH.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom) and node.module == module:
+                for alias in node.names:
+                    setattr(made, alias.name, type(alias.name, (Stand,), {}))
+        monkeypatch.setitem(sys.modules, module, made)
+    file = runpy.run_path(str(LAUNCH))
+    defaults = {name: default for name, (default, _) in launch_arguments().items()}
+    return lambda **given: file["start"]({**defaults, **given})
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({}, []),
+        ({"foxglove": "true"}, ["--foxglove"]),
+        ({"foxglove": "9000", "record": "out/bag"}, ["--foxglove", "9000", "--record", "out/bag"]),
+        (
+            {"config": "room.yaml", "source": "cameras", "rig": "lab.yaml", "cameras": "cam0,cam1"},
+            ["room.yaml", "--source", "cameras", "--rig", "lab.yaml", "--cameras", "cam0,cam1"],
+        ),
+        (
+            {"set": "pose.fit.engine=paper network.domain_id=42 namespace=/lab 'cameras=[cam1, cam2]'"},
+            ["--set", "pose.fit.engine=paper", "--set", "network.domain_id=42", "--set", "namespace=/lab", "--set",
+             "cameras=[cam1, cam2]"],
+        ),
+    ],
+)  # fmt: skip
+def test_the_launch_file_starts_what_the_command_line_starts(launched, given, words, tmp_path, monkeypatch):
+    """Every option of `smart_space`, and each process with its keys; `limbloc run` has the same."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("ROS_SECURITY_ENCLAVE_OVERRIDE", raising=False)
+    (tmp_path / "lab.yaml").write_bytes((CONFIG / "rig_example.yaml").read_bytes())
+    (tmp_path / "room.yaml").write_bytes((CONFIG / "smart_space.yaml").read_bytes())
+    parser = argparse.ArgumentParser()
+    smart_space.add_arguments(parser)
+    config = smart_space.config_from_arguments(parser.parse_args(words))
+    plans = plan_graph(config, tmp_path)
+    actions = launched(**given)
+    processes = [action for action in actions if type(action).__name__ == "Node"]
+    assert [process.options["exec_name"] for process in processes] == [plan.name for plan in plans]
+    for process, plan in zip(processes, plans, strict=True):
+        (description,) = process.options["arguments"]
+        # Both have a folder of their own for what lives as long as the run.
+        theirs, ours = (
+            re.sub(r'"[^"]*/(rig\.yaml|background)"', r'"\1"', text) for text in (description, plan.description)
+        )
+        assert theirs == ours
+        assert process.options["additional_env"] == {"ROS_SECURITY_ENCLAVE_OVERRIDE": f"/limbloc/{plan.name}"}
+    (over,) = [a.args[0] for a in actions if a.args and type(a.args[0]).__name__ == "OnShutdown"]
+    over.options["on_shutdown"](None, None)  # removes that folder
+    told = {a.args for a in actions if type(a).__name__ == "SetEnvironmentVariable"}
+    assert told == set(graph_environment(config.network).items())
+    options = {action.dest for action in parser._actions} - {"help"}
+    assert options <= set(launch_arguments())
 
 
 def test_everything_the_launch_file_imports_from_us_exists():

@@ -201,9 +201,7 @@ class Supervisor:
         name = child.plan.name
         ours, theirs = os.pipe()
         child.reader = self._forward(os.fdopen(ours, encoding="utf-8", errors="replace"), name)
-        # Names the process's keys, for graphs that run with ROS_SECURITY_ENABLE; who has chosen some keeps them.
-        variables = {"ROS_SECURITY_ENCLAVE_OVERRIDE": f"{ENCLAVES}/{name}"}
-        own = {key: value for key, value in variables.items() if key not in self._environment}
+        own = enclave_of(name, self._environment)
         try:
             self._starter.request(self._children.index(child), name, child.plan.description, own, theirs)
             child.requested = True
@@ -272,6 +270,12 @@ class Supervisor:
         if self._stop.is_set():
             self._hurry.set()
         self._stop.set()
+
+
+def enclave_of(name: str, environment: Mapping[str, str]) -> dict[str, str]:
+    """The variable that names a process's keys, for graphs with ROS_SECURITY_ENABLE; who has chosen some keeps them."""
+    variable = "ROS_SECURITY_ENCLAVE_OVERRIDE"
+    return {} if variable in environment else {variable: f"{ENCLAVES}/{name}"}
 
 
 def _cause(code: int) -> str:
