@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 import os
+from dataclasses import replace
 from functools import cache
 from types import SimpleNamespace
 from typing import Any
@@ -109,7 +110,22 @@ def _cloud_seeds() -> list[bytes]:
     sdf = ((np.sqrt(x * x + y * y + z * z) - 2.5) * 0.02).astype(np.float32)
     cloud = hull_to_cloud(Hull(0.02, (0, 0, 0), np.minimum(sdf, np.float32(0.06)), 0.06), Header())
     points = bytes(cloud.data)
-    return [bytes(8) + points[: 44 * 150], b"\1" * 8 + points[: 44 * 20], bytes(8)]
+    return [bytes(8) + points[: 48 * 150], b"\1" * 8 + points[: 48 * 20], bytes(8), bytes(8) + _cloud_with_views()]
+
+
+def _cloud_with_views() -> bytes:
+    """Points of a hull that carries the views of one camera."""
+    from std_msgs.msg import Header
+
+    from limbloc_ros.core.views import Views
+    from limbloc_ros.ros.cloud_messages import hull_to_cloud
+
+    camera = np.zeros((1, 35))
+    camera[0, [0, 4, 8]], camera[0, 11:16], camera[0, 31:33] = 1.0, (3.0, 100.0, 100.0, 32.0, 24.0), (64.0, 48.0)
+    views = Views(camera, np.array([[8, 8, 8, 6, 2, 0]]), np.arange(48, dtype=np.uint8) % 2)
+    indices = np.stack(np.unravel_index(np.arange(100), (5, 5, 4)), axis=1).astype(np.int32)
+    hull = Hull.from_shell(0.02, 0.06, indices, np.full(100, -0.02, np.float32))
+    return bytes(hull_to_cloud(replace(hull, views=views), Header()).data)
 
 
 @target("hull_cloud", _cloud_seeds, mutate_bytes, most=8000)
@@ -122,14 +138,14 @@ def hull_cloud(data: bytes) -> None:
 
     draw = Draw(data[:64] if data[:1] == b"\1" else data[:8])
     points = data[64 if data[:1] == b"\1" else 8 :]
-    msg = PointCloud2(height=1, width=len(points) // 44, point_step=44, fields=list(_HULL_FIELDS))
+    msg = PointCloud2(height=1, width=len(points) // 48, point_step=48, fields=list(_HULL_FIELDS))
     if data[:1] == b"\1":
         draw.take(1)
         msg.width, msg.height, msg.point_step = draw.integer(), draw.integer(), draw.integer()
-        msg.fields = msg.fields[: draw.below(15)]
+        msg.fields = msg.fields[: draw.below(16)]
         msg.is_bigendian = bool(draw.below(2))
     else:
-        points = points[: 44 * msg.width]
+        points = points[: 48 * msg.width]
     msg.data.frombytes(points)
     hull = cloud_to_hull(msg)
     if hull is None:
@@ -138,6 +154,11 @@ def hull_cloud(data: bytes) -> None:
     if hull.sdf.size < 10**6:
         assert hull.inside_count >= 0
         hull_to_cloud(hull, Header())
+    if hull.views is not None:
+        mismatch = hull.views.mismatch(
+            np.array([[0, 1, 1]]), np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.2]]), np.full(2, 0.1)
+        )
+        assert np.isfinite(mismatch)
 
 
 def _cdr_seeds() -> list[bytes]:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Hulls made of the figure's own flesh, for tests of the searches: they say whether a search finds what is there."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import figure_poses
@@ -30,6 +30,16 @@ def flesh_hull(state):
     flesh = placed.flesh()
     low, high = placed.spheres.min(axis=0) - 0.16, placed.spheres.max(axis=0) + 0.16
     return hull_where(lambda points: figure.flesh_distance(points, flesh)[0], low, high)
+
+
+def moved(hull, voxels):
+    """The same hull elsewhere in the room, and the cameras with it."""
+    shift = VOXEL * np.asarray(voxels)
+    index_min = tuple(int(i + v) for i, v in zip(hull.index_min, voxels, strict=True))
+    cameras = hull.views.cameras.copy()
+    cameras[:, 9:12] -= cameras[:, :9].reshape(-1, 3, 3) @ shift
+    views = replace(hull.views, cameras=cameras)
+    return replace(hull, index_min=index_min, viewpoints=hull.viewpoints + shift.astype(np.float32), views=views)
 
 
 POSTURES = {

@@ -9,11 +9,13 @@ from array import array
 
 import numpy as np
 import pytest
+from camera_rings import ball_masks, ring
 from sensor_msgs.msg import PointCloud2, PointField
 
+from limbloc_ros.core.config import HullConfig
 from limbloc_ros.core.engine_robust import outline_rays
 from limbloc_ros.core.errors import InputError
-from limbloc_ros.core.hull import NOBODY, Hull
+from limbloc_ros.core.hull import NOBODY, Hull, carve
 from limbloc_ros.core.surface import extract_surface
 from limbloc_ros.ros import messages
 from limbloc_ros.ros.cloud_messages import (
@@ -40,18 +42,18 @@ def test_bytes_of_one_voxel() -> None:
     indices, sdf = np.array([[10, -3, 50]], np.int32), np.array([-0.25], np.float32)
     msg = hull_to_cloud(Hull.from_shell(0.02, 0.06, indices, sdf), HEADER)
     voxel = (0.21, -0.05, 1.01, -0.25, 10, -3, 50)
-    assert bytes(msg.data) == struct.pack("<ffffhhhHIIfff", *voxel, NOBODY, 20_000, 60_000, 0, 0, 0)
-    assert (msg.width, msg.height, msg.point_step, msg.row_step, msg.is_bigendian) == (1, 1, 44, 44, False)
+    assert bytes(msg.data) == struct.pack("<ffffhhhHIIfffI", *voxel, NOBODY, 20_000, 60_000, 0, 0, 0, 0)
+    assert (msg.width, msg.height, msg.point_step, msg.row_step, msg.is_bigendian) == (1, 1, 48, 48, False)
     assert [(f.name, f.offset) for f in msg.fields][:4] == [("x", 0), ("y", 4), ("z", 8), ("sdf", 12)]
     assert [f.datatype for f in msg.fields] == [PointField.FLOAT32] * 4 + [PointField.INT16] * 3 + [
         PointField.UINT16
-    ] + [PointField.UINT32] * 2 + [PointField.FLOAT32] * 3
+    ] + [PointField.UINT32] * 2 + [PointField.FLOAT32] * 3 + [PointField.UINT32]
     assert (messages.stamp_ns(msg.header), msg.header.frame_id) == (1_700_000_000_123_456_789, "room")
 
     cut_by, viewpoints = np.array([1], np.uint8), np.array([[0, 0, 0], [2, -1, 1.5]], np.float32)
     hull = Hull.from_shell(0.02, 0.06, indices, sdf, cut_by=cut_by, viewpoints=viewpoints)
     cut = hull_to_cloud(hull, HEADER)
-    assert bytes(cut.data) == struct.pack("<ffffhhhHIIfff", *voxel, 1, 20_000, 60_000, 2, -1, 1.5)
+    assert bytes(cut.data) == struct.pack("<ffffhhhHIIfffI", *voxel, 1, 20_000, 60_000, 2, -1, 1.5, 0)
     back = cloud_to_hull(cut)
     assert back is not None
     assert back.cut_by is not None
@@ -118,6 +120,19 @@ def test_a_hull_of_which_nobody_knows_who_cut_it() -> None:
         assert back.sdf.tobytes() == hull.sdf.tobytes()
 
 
+def test_what_the_cameras_saw_travels_along_bit_for_bit() -> None:
+    rig = ring(4)
+    hull = carve(ball_masks(rig, [((0.0, 0.0, 1.0), 0.4)]), rig, HullConfig())
+    assert isinstance(hull, Hull)
+    assert hull.views is not None
+    back = cloud_to_hull(hull_to_cloud(hull, HEADER))
+    assert back is not None
+    assert back.views is not None
+    for name in ("cameras", "frames", "cells"):
+        assert getattr(back.views, name).tobytes() == getattr(hull.views, name).tobytes()
+    assert back.views.packed == hull.views.packed
+
+
 def test_where_nobody_cut_no_place_is_asked_for() -> None:
     """Bytes of a place are read only where a camera is named."""
     msg = overwritten(32, struct.pack("<fff", float("nan"), 1.0, 2.0))
@@ -148,9 +163,9 @@ def overwritten(offset: int, value: bytes) -> PointCloud2:
 @pytest.mark.parametrize(
     ("msg", "words"),
     [
-        (damaged(width=1_000_000_000), "1000000000x1 points needs 44000000000 bytes"),
+        (damaged(width=1_000_000_000), "1000000000x1 points needs 48000000000 bytes"),
         (damaged(data=array("B", bytes(100))), "got 100"),
-        (damaged(point_step=16), "44 bytes per point"),
+        (damaged(point_step=16), "48 bytes per point"),
         (damaged(is_bigendian=True), "little-endian"),
         (damaged(fields=[PointField(name="rgb")]), "got rgb"),
         (overwritten(12, struct.pack("<f", float("nan"))), "finite"),
@@ -160,6 +175,9 @@ def overwritten(offset: int, value: bytes) -> PointCloud2:
         (overwritten(22, struct.pack("<H", 256)), r"up to 255 \(nobody\), got 256"),
         (overwritten(22, struct.pack("<H", 65_535)), "got 65535"),
         (overwritten(22, struct.pack("<HIIf", 3, 100_000, 60_000, float("nan"))), "vp_x, vp_y, vp_z.*finite"),
+        (overwritten(44, struct.pack("<I", 4_000_000_000)), "cannot hold views of 4000000000 bytes"),
+        (overwritten(44, struct.pack("<I", 5)), "8 bytes or more"),
+        (overwritten(44, struct.pack("<I", 40)), "cannot be read"),
         (overwritten(22, struct.pack("<HIIfff", 0, 100_000, 60_000, 1.0, 2.0, float("-inf"))), "finite"),
     ],
 )

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from camera_rings import BODY, CONFIG, ball_masks, every_voxel, in_order, look_at, measured, ring, who_cut
 
-from limbloc_ros.core import hull as hulls
-from limbloc_ros.core import pipeline
+from limbloc_ros.core import mending, pipeline
 from limbloc_ros.core.camera import Rig
 from limbloc_ros.core.config import HullConfig
 from limbloc_ros.core.errors import InputError, NoPerson, RigError
@@ -76,8 +75,8 @@ def test_who_cut_a_hull_whose_mask_was_mended():
     config = dataclasses.replace(CONFIG, shared_veto=0.0)
     silhouettes = measured(rig, masks, config)
     voxels = evaluate(silhouettes, config.band_m)
-    covered = hulls.cover_silhouettes(silhouettes, voxels, config)
-    mended = hulls.mend_silhouettes(silhouettes, covered, voxels, config)
+    covered = mending.cover_silhouettes(silhouettes, voxels, config)
+    mended = mending.mend_silhouettes(silhouettes, covered, voxels, config)
     assert mended is not silhouettes
     indices, _, _, who = evaluate(mended, config.band_m)
     expected = {tuple(index): int(w) for index, w in zip(indices.tolist(), who, strict=True)}
@@ -221,9 +220,9 @@ def test_clean_masks_stay_the_very_same(eight):
     rig, masks, _ = eight
     silhouettes = measured(rig, masks, CONFIG)
     voxels = evaluate(silhouettes, CONFIG.band_m)
-    covered = hulls.cover_silhouettes(silhouettes, voxels, CONFIG)
-    assert hulls.unexplained_fraction(silhouettes, covered) == 0.0
-    assert hulls.mend_silhouettes(silhouettes, covered, voxels, CONFIG) is silhouettes
+    covered = mending.cover_silhouettes(silhouettes, voxels, CONFIG)
+    assert mending.unexplained_fraction(silhouettes, covered) == 0.0
+    assert mending.mend_silhouettes(silhouettes, covered, voxels, CONFIG) is silhouettes
 
 
 def test_cover_paints_squares_around_voxels(eight):
@@ -231,7 +230,7 @@ def test_cover_paints_squares_around_voxels(eight):
     rig, masks, _ = eight
     silhouettes = measured(rig, masks, CONFIG)
     voxels = evaluate(silhouettes, CONFIG.band_m)
-    covered = hulls.cover_silhouettes(silhouettes, voxels, CONFIG)
+    covered = mending.cover_silhouettes(silhouettes, voxels, CONFIG)
     points = (voxels[0][voxels[1] < 0] + 0.5) * CONFIG.voxel_m
     for c, name in enumerate(silhouettes.names):
         camera = rig.camera(name)
@@ -265,5 +264,5 @@ def test_the_warm_up_mends_too():
     rig, config = pipeline._warm_up_room()
     silhouettes = measured(rig, pipeline._warm_up_masks(), config)
     voxels = evaluate(silhouettes, config.band_m)
-    covered = hulls.cover_silhouettes(silhouettes, voxels, config)
-    assert hulls.mend_silhouettes(silhouettes, covered, voxels, config) is not silhouettes
+    covered = mending.cover_silhouettes(silhouettes, voxels, config)
+    assert mending.mend_silhouettes(silhouettes, covered, voxels, config) is not silhouettes

@@ -41,6 +41,8 @@ CORE_ORDER = (
     "background_estimate",
     "background",
     "silhouettes",
+    "views",
+    "mending",
     "hull",
     "surface",
     "geodesic",

@@ -5,7 +5,7 @@ import cv2
 import numpy as np
 import pytest
 
-from limbloc_ros.core import hull
+from limbloc_ros.core import hull, mending
 from limbloc_ros.core.config import HullConfig
 from limbloc_ros.core.silhouettes import measure_silhouettes, pack_cameras
 from limbloc_ros.recordings.cases import Case, load_case
@@ -22,8 +22,8 @@ def volumes(case: Case, masks: dict[str, np.ndarray]) -> tuple[int, int]:
     """Inside voxels of the strict intersection, and after mending."""
     silhouettes = measure_silhouettes(masks, case.rig, pack_cameras(case.rig), CONFIG)
     voxels = hull.evaluate(silhouettes, CONFIG.band_m)
-    covered = hull.cover_silhouettes(silhouettes, voxels, CONFIG)
-    mended = hull.mend_silhouettes(silhouettes, covered, voxels, CONFIG)
+    covered = mending.cover_silhouettes(silhouettes, voxels, CONFIG)
+    mended = mending.mend_silhouettes(silhouettes, covered, voxels, CONFIG)
     after = hull.evaluate(mended, CONFIG.band_m)
     return int((voxels[1] < 0).sum()), int((after[1] < 0).sum())
 
@@ -45,3 +45,42 @@ def test_an_arm_that_one_of_four_masks_lost_comes_back(four: Case) -> None:
     strict, mended = volumes(four, masks)
     assert strict < whole
     assert whole - mended < 0.5 * (whole - strict)
+
+
+@pytest.fixture(scope="module")
+def eight(request: pytest.FixtureRequest) -> Case:
+    return load_case(request.config.rootpath / "test" / "data" / "benchmark" / "public" / "seq_walk_circle")
+
+
+def inside(case: Case, masks: dict[str, np.ndarray], point: np.ndarray) -> float:
+    """Signed distance of the carved hull at a point, m."""
+    carved = hull.largest_component(hull.carve(masks, case.rig, CONFIG))
+    at = np.round((point - carved.origin_m) / carved.voxel_m).astype(int)
+    fits = (at >= 0).all() and (at < carved.sdf.shape).all()
+    return float(carved.sdf[tuple(at)]) if fits else CONFIG.band_m
+
+
+def test_a_shin_that_two_of_eight_masks_lost_comes_back(eight: Case) -> None:
+    frame = 20
+    masks = eight.masks(frame)
+    ends = np.stack([eight.truth[f"{j}_L"][frame] for j in ("knee", "ankle")])
+    for camera in (eight.rig.cameras[1], eight.rig.cameras[4]):
+        uv, _ = camera.world_to_image(ends)
+        (x0, y0), (x1, y1) = uv.round().astype(int).tolist()
+        masks[camera.name] = cv2.line(masks[camera.name].copy(), (x0, y0), (x1, y1), 0, 30)
+    middle = ends.mean(axis=0)
+    silhouettes = measure_silhouettes(masks, eight.rig, pack_cameras(eight.rig), CONFIG)
+    voxels = hull.evaluate(silhouettes, CONFIG.band_m)
+    covered = mending.cover_silhouettes(silhouettes, voxels, CONFIG)
+    once = hull.evaluate(mending.mend_silhouettes(silhouettes, covered, voxels, CONFIG), CONFIG.band_m)
+    left = (once[0][once[1] < 0] + 0.5) * CONFIG.voxel_m
+    assert np.linalg.norm(left - middle, axis=1).min() > 0.04  # each of the two was outvoted by nobody
+    assert inside(eight, masks, middle) < -0.02
+    assert inside(eight, eight.masks(frame), middle) < -0.02
+
+
+def test_clean_masks_of_eight_cameras_gain_nothing_from_outvoting_two(eight: Case) -> None:
+    silhouettes = measure_silhouettes(eight.masks(20), eight.rig, pack_cameras(eight.rig), CONFIG)
+    voxels = hull.evaluate(silhouettes, CONFIG.band_m)
+    covered = mending.cover_silhouettes(silhouettes, voxels, CONFIG)
+    assert mending.mend_twice_denied(silhouettes, covered, voxels, CONFIG) is silhouettes

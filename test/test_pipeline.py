@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from flesh_hulls import moved
 
 from limbloc_ros.core._figure_kernels import exp_so3
 from limbloc_ros.core.confidence import joint_sigma
@@ -46,11 +47,6 @@ def alone(frame):
 def first_of_many(frame):
     """The pose of the first frame of a stream, for which less is searched: the next frames can mend it."""
     return PoseEstimator(FitConfig(temporal=True)).estimate(hull_of(frame))
-
-
-def moved(hull, voxels):
-    """The same hull elsewhere in the room."""
-    return dataclasses.replace(hull, index_min=tuple(int(i + v) for i, v in zip(hull.index_min, voxels, strict=True)))
 
 
 def errors(pose, frame, shift=(0.0, 0.0, 0.0)):

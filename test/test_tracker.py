@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from flesh_hulls import moved
 
 from limbloc_ros.core import tracker
 from limbloc_ros.core.engine_robust import Fit
@@ -99,7 +100,7 @@ def test_a_jump_is_followed_by_the_centre_of_the_surface():
     follower = Tracker(seed=0)
     follow(follower, 20)
     voxels = np.array([-70, 40, 0])
-    hull = replace(hull_of(21), index_min=tuple(int(i) for i in np.asarray(hull_of(21).index_min) + voxels))
+    hull = moved(hull_of(21), voxels)
     jumped = follower.follow(hull, extract_surface(hull))
     error = np.linalg.norm(place(jumped.state).joints - truth_of(21) - 0.02 * voxels, axis=1)
     assert np.median(error) < 0.03
@@ -159,6 +160,7 @@ class Stand:
         self.frame = 0
         monkeypatch.setattr(tracker, "fit_from_scratch", self.search)
         monkeypatch.setattr(tracker, "refine", self.refine)
+        monkeypatch.setattr(tracker, "unseen", lambda state, hull: 0.0)
         monkeypatch.setattr(tracker, "gather_evidence", lambda *args: SimpleNamespace(args=args))
         monkeypatch.setattr(Tracker, "_check_limbs", self.check)
         monkeypatch.setattr(tracker.energy, "system", self.system)

@@ -96,6 +96,7 @@ def limb_fits(
     gaps: Any,
     costs: Any,
     own: Any,
+    placed: Any,
 ) -> None:
     """Place the figure's own limb on every candidate and weigh it with the terms of the energy.
 
@@ -122,6 +123,7 @@ def limb_fits(
         limit_weight: weight of their violation.
         gaps, costs: [M, Q] out: gated distance and cost of a point, inf where the body explains it better.
         own: [M] out: what the limb costs by itself.
+        placed: [M, S, 3] out: where the limb's spheres are.
     """
     first = np.empty((3, 3))
     second = np.empty((3, 3))
@@ -159,6 +161,7 @@ def limb_fits(
             R = first if limb_bones[n] == 0 else second
             for i in range(3):
                 spheres[s, i] = start[i] + R[i, 0] * offsets[n, 0] + R[i, 1] * offsets[n, 1] + R[i, 2] * offsets[n, 2]
+                placed[m, n, i] = spheres[s, i]
         rows, bounds = lay_out(limb_parts, spheres, radii)
         p = -1
         for q in range(len(query)):

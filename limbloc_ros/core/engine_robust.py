@@ -16,6 +16,7 @@ from limbloc_ros.core.hull import Hull
 from limbloc_ros.core.limb_pairs import best_limbs, limb_pairs, with_limb
 from limbloc_ros.core.search import ARM, LEG, Medial
 from limbloc_ros.core.surface import Surface
+from limbloc_ros.core.views import Views
 
 Array = NDArray[np.float64]
 Refined = lm.LmResult[FigureState]
@@ -47,6 +48,7 @@ class Effort:
         lenient_limits: weight of joint limits at first.
         enough: an energy (m^2) below which the figure is believed and nothing more is searched.
         certain: an energy below which the winner's limbs are not tried elsewhere.
+        shown: whether limbs are placed by what the silhouettes show as well; takes as long again.
         dressed: whether figures may wear loose clothes while they are searched; they begin with those of the last fit.
     """
 
@@ -70,6 +72,7 @@ class Effort:
     lenient_limits: float = 3e-3
     enough: float = 3.4e-4
     certain: float = 0.0
+    shown: bool = True
     dressed: bool = False
 
 
@@ -78,15 +81,18 @@ class Effort:
 SEARCH_WEIGHTS = {"inclusion": 0.006, "surface_width_m": 0.06, "clothing": 1e-2}
 #: Weight of clothing when figures are judged, and when it is searched again.
 JUDGED_CLOTHING = 2e-5
+#: What figures that share nothing with the silhouettes would pay beside their energy, m^2. Of noisy masks the right
+#: figure often has the higher energy (a limb that one mask lost is not in the hull), but hardly ever the higher sum.
+SEEN_WEIGHT = 1e-2
 #: One search after the other, until the energy is low: most figures are found easily. Of 170 frames four in ten ended
 #: below 2e-4 in the first search, and none of these was wrong where a harder search was right.
 QUICK = Effort(
     torsos=2, leg_pairs=2, starts=3, survivors=2, arm_repairs=1, strict=2, single_arms=2, single_legs=1, rounds=1,
-    finalists=1, candidates=32, enough=2e-4, certain=1.6e-4,
+    finalists=1, candidates=32, enough=2e-4, certain=1.6e-4, shown=False,
 )  # fmt: skip
 HARDER = Effort(
-    torsos=14, torso_search=search.TorsoSearch(headings=12, listed=3000, climbed=60, steps=480), leg_pairs=4, starts=24,
-    survivors=8, repaired=3, finalists=5, enough=0.0, dressed=True,
+    torsos=14, torso_search=search.TorsoSearch(headings=12, listed=3000, compared=200, climbed=60, steps=480),
+    leg_pairs=4, starts=24, survivors=8, repaired=3, finalists=5, enough=0.0, dressed=True,
 )  # fmt: skip
 SEARCHES = (QUICK, Effort(), HARDER)
 #: Torsos of one hull that differ and are worth a try.
@@ -108,12 +114,19 @@ class Fit:
         system: energy, gradient and matrix there.
         rivals: figures that explain the hull nearly as well, each with its energy over that of the best of them.
         judged: the energy (m^2) of the figure with the weights by which figures are told apart.
+        unseen: what its mismatch with the silhouettes adds to that (m^2) when it is compared with others.
     """
 
     state: FigureState
     system: lm.System
     rivals: Rivals = ()
     judged: float = 0.0
+    unseen: float = 0.0
+
+    @property
+    def verdict(self) -> float:
+        """By this (m^2) fits of one hull are compared."""
+        return self.judged + self.unseen
 
 
 def gather_evidence(
@@ -183,6 +196,7 @@ class Scene:
 
     Attributes:
         hull, medial: the volume.
+        views: the silhouettes, if limbs are placed by them as well.
         quick, full: few and many surface points.
         lenient, strict, weights: the energy's weights, at first, for the choice among figures, and in the end. Limbs
             are placed with a guess of their turn about themselves, so joint limits give way until that has settled.
@@ -190,6 +204,7 @@ class Scene:
 
     hull: Hull
     medial: Medial
+    views: Views | None
     quick: Evidence
     full: Evidence
     lenient: Weights
@@ -221,7 +236,7 @@ def _with_pairs(
     taken = search.explained_volume(hull, placed, solid)
     left, right = (search.limb_candidates(hull, scene.medial, placed, kind, side, taken, candidates) for side in "LR")
     out = []
-    for a, b, _ in limb_pairs(placed, left, right, kind, body, scene.quick, scene.lenient, pairs):
+    for a, b, _ in limb_pairs(placed, left, right, kind, body, scene.quick, scene.lenient, pairs, scene.views):
         limbed = with_limb(state, placed, kind, "L", left.found[a])
         out.append(with_limb(limbed, placed, kind, "R", right.found[b]))
     return out or [state]
@@ -237,7 +252,7 @@ def with_one_limb(
     solid = body if kind is ARM else search.UPPER_TRUNK_PARTS
     taken = search.explained_volume(scene.hull, placed, solid)
     limbs = search.limb_candidates(scene.hull, scene.medial, placed, kind, side, taken, candidates)
-    rows = best_limbs(placed, limbs, kind, side, body, scene.quick, scene.lenient, keep)
+    rows = best_limbs(placed, limbs, kind, side, body, scene.quick, scene.lenient, keep, scene.views)
     return [with_limb(state, placed, kind, side, limbs.found[row]) for row in rows]
 
 
@@ -250,7 +265,7 @@ def make_scene(hull: Hull, medial: Medial, surface: Surface, seed: int, weights:
     lenient = replace(strict, limits=effort.lenient_limits)
     if effort.dressed:
         strict, lenient = _dressed(strict), _dressed(lenient)
-    return Scene(hull, medial, quick, full, lenient, strict, weights)
+    return Scene(hull, medial, hull.views if effort.shown else None, quick, full, lenient, strict, weights)
 
 
 def fit_from_scratch(
@@ -269,7 +284,7 @@ def fit_from_scratch(
         searches: one is made after the other until one ends with an energy that is low enough for it.
 
     Returns:
-        the fit of lowest energy, or None when no torso fits into the hull.
+        the fit of lowest energy and mismatch with the silhouettes, or None when no torso fits into the hull.
     """
     medial = Medial.of(hull)
     torsos: list[FigureState] = []
@@ -285,8 +300,9 @@ def fit_from_scratch(
             clothes = best.state.shape[figure.proportions().clothing_from :]
             some = [_wearing(torso, clothes) for torso in some]
         found, rivals, judged = _fit_from_torsos(some, scene, effort)
-        if best is None or judged < best.judged:
-            best = Fit(found.state, found.system, rivals, judged)
+        fit = Fit(found.state, found.system, rivals, judged, unseen(found.state, hull))
+        if best is None or fit.verdict < best.verdict:
+            best = fit
         if best.judged < effort.enough:
             break
     return best
@@ -323,17 +339,17 @@ def _fit_from_torsos(torsos: list[FigureState], scene: Scene, effort: Effort) ->
     quick, lenient = scene.quick, scene.lenient
     starts = _with_limbs(torsos, scene, effort)
     tried = [refine(state, quick, lenient, first) for state in _cheapest(starts, scene, effort.starts)]
-    tried = [refine(r.state, quick, lenient, second) for r in _best(tried, effort.survivors)]
+    tried = [refine(r.state, quick, lenient, second) for r in _best(tried, effort.survivors, scene.hull)]
     # With the trunk in place and sizes adapted, limbs are looked for once more.
-    for candidate in _best(tried, effort.repaired):
+    for candidate in _best(tried, effort.repaired, scene.hull):
         others = with_arms(candidate.state, scene, effort.arm_repairs, effort.candidates)
         others += _cheapest(_with_limbs([candidate.state], scene, effort), scene, effort.leg_repairs)
         tried += [refine(state, quick, lenient, repair) for state in others]
-    least = _best(tried, 1)[0].system.cost
+    least = min(r.system.cost for r in tried)
     rivals = tuple((r.state, r.system.cost / least) for r in tried if r.system.cost < RIVAL_COST * least)
-    tried = [refine(r.state, quick, scene.strict, limited) for r in _best(tried, effort.strict)]
-    finals = [refine(r.state, scene.full, scene.strict, final) for r in _best(tried, effort.finalists)]
-    winner = _best(finals, 1)[0]
+    tried = [refine(r.state, quick, scene.strict, limited) for r in _best(tried, effort.strict, scene.hull)]
+    finals = [refine(r.state, scene.full, scene.strict, final) for r in _best(tried, effort.finalists, scene.hull)]
+    winner = _best(finals, 1, scene.hull)[0]
     winner = refine(winner.state, scene.full, scene.weights, final)
     if effort.certain > 0.0 and (judged := _judged(winner, scene)) < effort.certain:
         return winner, rivals, judged
@@ -355,7 +371,7 @@ def _with_better_limb(
     for state in with_one_limb(winner.state, scene, kind, side, places, effort.candidates):
         settled = refine(state, scene.quick, scene.lenient, repair).state
         other = refine(settled, scene.full, scene.weights, limited)
-        if other.system.cost < winner.system.cost:
+        if other.system.cost + unseen(other.state, scene.hull) < winner.system.cost + unseen(winner.state, scene.hull):
             winner = refine(other.state, scene.full, scene.weights, final)
     return winner
 
@@ -378,5 +394,13 @@ def _cheapest(states: list[FigureState], scene: Scene, keep: int) -> list[Figure
     return [states[i] for i in np.argsort(costs, kind="stable")[:keep]]
 
 
-def _best(results: list[Refined], keep: int) -> list[Refined]:
-    return sorted(results, key=lambda r: r.system.cost)[:keep]
+def unseen(state: FigureState, hull: Hull) -> float:
+    """What a figure's mismatch with the silhouettes adds to its energy when it is compared with others, m^2."""
+    if hull.views is None:
+        return 0.0
+    placed = figure.place(state)
+    return SEEN_WEIGHT * hull.views.mismatch(figure.PART_SPHERES, placed.spheres, placed.radii)
+
+
+def _best(results: list[Refined], keep: int, hull: Hull) -> list[Refined]:
+    return sorted(results, key=lambda r: r.system.cost + unseen(r.state, hull))[:keep]

@@ -17,11 +17,13 @@ from numpy.typing import NDArray
 
 from limbloc_ros.core import _block_kernels as near
 from limbloc_ros.core import _hull_kernels as kernels
-from limbloc_ros.core import _mending_kernels as mending
+from limbloc_ros.core import _mending_kernels as mending_kernels
+from limbloc_ros.core import mending
 from limbloc_ros.core._hull_kernels import LEAF
 from limbloc_ros.core.camera import Rig
 from limbloc_ros.core.config import HullConfig
 from limbloc_ros.core.errors import InputError, NoPerson
+from limbloc_ros.core.mending import INNER_PX, Voxels, cover_silhouettes
 from limbloc_ros.core.silhouettes import (
     PixelCounts,
     Silhouettes,
@@ -29,20 +31,18 @@ from limbloc_ros.core.silhouettes import (
     min_seen,
     pack_cameras,
 )
+from limbloc_ros.core.views import Views
 
-#: A silhouette's rim of this width is not asked whether the hull explains it: voxels are coarser than pixels.
-INNER_PX = 1.5
 #: Fraction of unexplained foreground from which on the cameras contradict each other as much as we distinguish.
 DOUBTED_FRACTION = 0.02
 #: A part of the hull is a phantom when in all cameras but one less of what it covers is covered by it alone.
 PHANTOM_SHARE = 0.1
 #: A carve volume that ends below this height, m, ends at the floor.
 FLOOR_M = 0.5
+#: By so many voxels of the hull its silhouettes are told from other blobs.
+VIEW_POINTS = 500
 #: In `Hull.cut_by`: no camera decided here.
 NOBODY = 255
-
-#: Lattice indices [V, 3], largest and second largest camera distance [V] m, camera of the largest [V].
-Voxels = tuple[NDArray[np.int32], NDArray[np.float32], NDArray[np.float32], NDArray[np.int16]]
 
 
 @dataclass(frozen=True)
@@ -59,6 +59,7 @@ class Hull:
         cut_by: uint8 [nx, ny, nz] which camera's silhouette decided the signed distance: a row of `viewpoints`, or
             NOBODY. None if that is not known.
         viewpoints: float32 [C, 3] centres of the cameras, m, world.
+        views: what the cameras saw, by which figures are judged; None if that is not known.
     """
 
     voxel_m: float
@@ -69,6 +70,7 @@ class Hull:
     rejected: dict[str, str] = field(default_factory=dict)
     cut_by: NDArray[np.uint8] | None = None
     viewpoints: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 3), np.float32))
+    views: Views | None = None
 
     @property
     def origin_m(self) -> NDArray[np.float64]:
@@ -199,69 +201,6 @@ def evaluate_live(silhouettes: Silhouettes, config: HullConfig) -> tuple[Silhoue
         )
 
 
-def cover_silhouettes(silhouettes: Silhouettes, voxels: Voxels, config: HullConfig) -> NDArray[np.uint8]:
-    """Which pixels the hull's voxels project to, or are to be ignored; uint8 in the layout of `silhouettes.field`."""
-    indices, first, _, _ = voxels
-    covered = np.zeros(silhouettes.field.size, np.uint8)
-    centres = (np.ascontiguousarray(indices[first < 0].T) + 0.5) * config.voxel_m
-    mending.cover(centres, 0.875 * config.voxel_m, silhouettes.cameras, silhouettes.boxes, covered)
-    for (x, y, width, height, offset), ignored in zip(silhouettes.boxes, silhouettes.ignored, strict=True):
-        if ignored is not None:
-            covered[offset : offset + width * height] |= ignored[y : y + height, x : x + width].ravel()
-    return covered
-
-
-def unexplained_fraction(silhouettes: Silhouettes, covered: NDArray[np.uint8]) -> float:
-    """Mean over the cameras of the fraction of foreground (but its rim) that no voxel covers: 0 if all agree."""
-    counts = mending.count_bare(silhouettes.field, covered, silhouettes.boxes, INNER_PX)
-    return float(np.mean(counts[:, 1] / np.maximum(counts[:, 0], 1)))
-
-
-def mend_silhouettes(
-    silhouettes: Silhouettes, covered: NDArray[np.uint8], voxels: Voxels, config: HullConfig
-) -> Silhouettes:
-    """Give back to a silhouette what it lost, on the evidence of all other cameras.
-
-    Where a mask misses a limb, the strict intersection loses the limb, and then the *other* masks show foreground
-    that no part of the hull explains. So a voxel that exactly one camera denies is given back when at least two
-    other cameras see it on unexplained foreground, or (six cameras or more) when it lies so deep inside all other
-    silhouettes that only a hole in the one mask can be the reason. Consistent masks leave nothing unexplained and
-    stay as they are.
-
-    Args:
-        silhouettes: as measured.
-        covered: what `cover_silhouettes` found.
-        voxels: what `evaluate` found.
-        config: `repair_depth_m`, voxel size.
-
-    Returns:
-        silhouettes with the mended ones measured anew, or the very same object when nothing was to mend.
-    """
-    indices, first, second, who = voxels
-    if len(silhouettes.names) < 3:
-        return silhouettes
-    half = 0.5 * config.voxel_m
-    denied = (first >= 0) & (second < np.float32(-0.25 * half))
-    if not denied.any():
-        return silhouettes
-    table = (silhouettes.cameras, silhouettes.boxes)
-    points, deniers, depths = (indices[denied] + 0.5) * config.voxel_m, who[denied], -second[denied]
-    unexplained = mending.count_unexplained(points, deniers, *table, silhouettes.field, covered, INNER_PX)
-    # Few cameras leave a hull so fat that depth says little: four of them gain 12 % phantom volume from clean masks,
-    # a third from ragged ones.
-    deep = depths > (config.repair_depth_m if len(silhouettes.names) >= 6 else np.inf)
-    give_back = (unexplained >= 2) | deep
-    changes: dict[int, tuple[NDArray[np.uint8], int, int]] = {}
-    for c in map(int, np.unique(deniers[give_back])):
-        mine = give_back & (deniers == c)
-        balls = (points[mine], np.maximum(depths[mine], half), silhouettes.cameras, c)
-        left, right, top, bottom = mending.bound_balls(*balls)
-        mask, left, top = silhouettes.part_of_mask(c, left, right, top, bottom)
-        if mending.paint_balls(*balls, left, top, mask):
-            changes[c] = mask, left, top
-    return silhouettes.with_masks(changes) if changes else silhouettes
-
-
 def carve_silhouettes(silhouettes: Silhouettes, rig: Rig, config: HullConfig) -> Hull | NoPerson:
     """Carve the hull from measured silhouettes; see `carve`."""
     # A few cameras of many leave far too much standing: better no hull than a confident wrong one.
@@ -274,10 +213,15 @@ def carve_silhouettes(silhouettes: Silhouettes, rig: Rig, config: HullConfig) ->
         )
     silhouettes, voxels = evaluate_live(silhouettes, config)
     covered = cover_silhouettes(silhouettes, voxels, config)
-    contradiction = unexplained_fraction(silhouettes, covered)
-    mended = mend_silhouettes(silhouettes, covered, voxels, config)
+    contradiction = mending.unexplained_fraction(silhouettes, covered)
+    mended = mending.mend_silhouettes(silhouettes, covered, voxels, config)
     if mended is not silhouettes:
         voxels = evaluate_again(voxels, silhouettes, mended, config.band_m)
+    if contradiction > DOUBTED_FRACTION:  # else it is not worth looking for what two masks miss at one place
+        once = mended
+        mended = mending.mend_twice_denied(once, cover_silhouettes(once, voxels, config), voxels, config)
+        if mended is not once:
+            voxels = evaluate_again(voxels, once, mended, config.band_m)
     # Ragged masks bite a little from every side. The more the cameras contradict each other, the less may a single
     # one decide; with few cameras two vetoes would leave far too much.
     doubt = 0.0
@@ -296,12 +240,17 @@ def carve_silhouettes(silhouettes: Silhouettes, rig: Rig, config: HullConfig) ->
         who,
         np.stack([rig.camera(name).T_world_camera[:3, 3] for name in silhouettes.names]).astype(np.float32),
     )
+    inside = indices[distance < 0]
+    every = max(1, len(inside) // VIEW_POINTS)
+    views = Views.of(mended, (inside[::every] + 0.5) * config.voxel_m)
     labels, sizes = _label(hull)
     if len(sizes) > 2:
         hull = _with_labels(hull, labels, _people_among(hull, labels, sizes, silhouettes, config))
     if hull.inside_count * (config.voxel_m / 0.02) ** 3 < config.min_voxels:
         return NoPerson(f"the hull has only {hull.inside_count} voxels of {config.voxel_m} m: too small for a person")
-    return hull
+    # They travel with the hull's voxels, a word each (see `ros.cloud_messages`); only of tiny hulls there are too few.
+    room = 4 * int(np.count_nonzero(hull.sdf < np.float32(config.band_m)))
+    return replace(hull, views=views) if 4 + len(views.packed) <= room else hull
 
 
 def largest_component(hull: Hull) -> Hull:
@@ -357,7 +306,9 @@ def _cover(hull: Hull, labels: NDArray[np.int32], label: int, silhouettes: Silho
     local = np.stack(np.nonzero(((labels == label) & (hull.sdf < 0))[::2, ::2, ::2])) * 2
     centres = (local + np.asarray(hull.index_min)[:, None] + 0.5) * hull.voxel_m
     covered = np.zeros(silhouettes.field.size, np.uint8)
-    mending.cover(np.ascontiguousarray(centres), 1.75 * hull.voxel_m, silhouettes.cameras, silhouettes.boxes, covered)
+    mending_kernels.cover(
+        np.ascontiguousarray(centres), 1.75 * hull.voxel_m, silhouettes.cameras, silhouettes.boxes, covered
+    )
     return covered & (silhouettes.field < -INNER_PX)
 
 

@@ -19,6 +19,7 @@ from limbloc_ros.core import energy, figure
 from limbloc_ros.core.energy import Evidence, Weights
 from limbloc_ros.core.figure import BONE, FigureState, Placed
 from limbloc_ros.core.search import ARM, LimbKind, Limbs
+from limbloc_ros.core.views import Views
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -31,6 +32,9 @@ EXPLAINED_M = 0.006
 MOST_POINTS, REACH_M = 120, 0.12
 #: So many candidates of either side are paired.
 PAIRED = 40
+#: Of the silhouettes' cells that the body leaves open so many are asked, and what all of a silhouette counts, m^2.
+#: (More than this, and legs spread to fill a skirt.)
+MOST_CELLS, SEEN_WEIGHT = 120, 3e-3
 
 
 @dataclass(frozen=True)
@@ -109,6 +113,7 @@ def limb_pairs(
     evidence: Evidence,
     weights: Weights,
     keep: int,
+    views: Views | None = None,
 ) -> list[tuple[int, int, float]]:
     """Pairs of a left and a right limb of lowest energy together with the rest of the figure.
 
@@ -119,6 +124,7 @@ def limb_pairs(
         body: indices of the parts that are believed already; those that move with the limbs are left out.
         evidence, weights: the energy's.
         keep: how many pairs to return; they differ by APART_M in some limb's end.
+        views: the silhouettes, which limbs explain as well; None if they are not known.
 
     Returns:
         (index left, index right, energy of the terms that pairs differ in, m^2), the best first.
@@ -126,7 +132,7 @@ def limb_pairs(
     if len(left.found) == 0 or len(right.found) == 0:
         return []
     w = weights
-    question = _open_question(placed, kind, ("L", "R"), body, evidence, w)
+    question = _open_question(placed, kind, ("L", "R"), body, evidence, w, views)
     fits = [_fits(placed, limbs, kind, side, question, evidence, w) for limbs, side in ((left, "L"), (right, "R"))]
     costs, point_weight = question.costs, question.point_weight
     best = [kernels.best_alone(*fit, costs, point_weight, PAIRED) for fit in fits]
@@ -138,7 +144,15 @@ def limb_pairs(
 
 
 def best_limbs(
-    placed: Placed, limbs: Limbs, kind: LimbKind, side: str, body: Ints, evidence: Evidence, weights: Weights, keep: int
+    placed: Placed,
+    limbs: Limbs,
+    kind: LimbKind,
+    side: str,
+    body: Ints,
+    evidence: Evidence,
+    weights: Weights,
+    keep: int,
+    views: Views | None = None,
 ) -> list[int]:
     """Candidates for one limb of lowest energy together with the rest of the figure, the other limb included.
 
@@ -147,10 +161,11 @@ def best_limbs(
         limbs: candidates.
         side: `L` or `R`.
         keep: how many to return; their ends lie APART_M apart.
+        views: as in `limb_pairs`.
     """
     if len(limbs.found) == 0:
         return []
-    question = _open_question(placed, kind, (side,), body, evidence, weights)
+    question = _open_question(placed, kind, (side,), body, evidence, weights, views)
     fit = _fits(placed, limbs, kind, side, question, evidence, weights)
     chosen: list[int] = []
     for row in kernels.best_alone(*fit, question.costs, question.point_weight, len(limbs.found)):
@@ -162,9 +177,14 @@ def best_limbs(
 
 @dataclass(frozen=True)
 class _OpenQuestion:
-    """The surface points that the body leaves to the limbs: themselves, how near the body is, and what they cost so.
+    """What the body leaves to the limbs.
 
-    `surface` [3] is what the kernels must know of the surface term: width, gate and weight inside.
+    Attributes:
+        scene, gap: surface points, with normals and rays, and how near the body is to each, m.
+        surface: [3] what the kernels must know of the surface term: width, gate and weight inside.
+        costs: of each point, and of each of `cells`, when no limb explains it.
+        point_weight: that costs are multiplied by.
+        views, drawn, cells: the silhouettes, the body in them, and the open cells that are asked.
     """
 
     scene: tuple[Array, Array, Array]
@@ -172,10 +192,19 @@ class _OpenQuestion:
     gap: Array
     costs: Array
     point_weight: float
+    views: Views | None
+    drawn: NDArray[np.int16]
+    cells: Ints
 
 
 def _open_question(
-    placed: Placed, kind: LimbKind, sides: tuple[str, ...], body: Ints, evidence: Evidence, w: Weights
+    placed: Placed,
+    kind: LimbKind,
+    sides: tuple[str, ...],
+    body: Ints,
+    evidence: Evidence,
+    w: Weights,
+    views: Views | None,
 ) -> _OpenQuestion:
     body = np.setdiff1d(body, np.concatenate([_limb_table(kind, side).parts for side in sides]))
     surface = np.array([w.surface_width_m, w.normal_gate_m, w.surface_inside])
@@ -186,7 +215,13 @@ def _open_question(
     share = w.surface * float(evidence.point_weights[rows].sum())
     rows = rows[:: -(-len(rows) // MOST_POINTS) or 1]
     asked = scene[0][rows], scene[1][rows], scene[2][rows]
-    return _OpenQuestion(asked, surface, np.minimum(gap[rows], REACH_M), costs[rows], share / max(len(rows), 1))
+    point_weight = share / max(len(rows), 1)
+    costs, drawn, cells = costs[rows], np.zeros(0, np.int16), np.zeros(0, np.int64)
+    if views is not None and len(rows):
+        drawn = views.drawn(figure.PART_SPHERES[body], placed.spheres, placed.radii)
+        cells, weights = views.open_cells(drawn, MOST_CELLS)
+        costs = np.concatenate([costs, SEEN_WEIGHT / point_weight * weights])
+    return _OpenQuestion(asked, surface, np.minimum(gap[rows], REACH_M), costs, point_weight, views, drawn, cells)
 
 
 def _fits(
@@ -211,6 +246,7 @@ def _fits(
     offsets = np.einsum("nji,nj->ni", rotations[carrier], placed.spheres[table.spheres] - origins[carrier])
     count, asked = len(limbs.found), len(question.gap)
     gaps, costs, own = np.empty((count, asked)), np.empty((count, asked)), np.empty(count)
+    where = np.empty((count, len(table.spheres), 3))
     kernels.limb_fits(
         limbs.found, origins[first], rotations[figure.PARENTS[first]], _hinge_rest(kind, first), table.sign, joints,
         table.spheres, table.sphere_bones, offsets, placed.spheres.copy(), placed.radii, figure.PART_SPHERES,
@@ -219,6 +255,14 @@ def _fits(
         np.array([w.inclusion_slack_m, w.inclusion_width_m, w.inclusion]), table.penetration,
         np.array([w.penetration_allowed, w.penetration_width_m, w.penetration]),
         energy.REST_ROTATIONS[first], table.low, table.high, w.limits,
-        gaps, costs, own,
+        gaps, costs, own, where,
     )  # fmt: skip
+    if question.views is not None and len(question.cells):  # a limb explains a cell that it covers, or not at all
+        balls = np.column_stack([placed.radii, placed.spheres])
+        covers, bare = question.views.limbs(
+            figure.PART_SPHERES[table.parts], table.spheres, where, balls, question.drawn, question.cells
+        )
+        gaps = np.concatenate([gaps, np.where(covers, 0.0, np.inf)], axis=1)
+        costs = np.concatenate([costs, np.zeros(covers.shape)], axis=1)
+        own = own + SEEN_WEIGHT * bare
     return gaps, costs, own

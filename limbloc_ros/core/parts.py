@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -123,7 +123,7 @@ def divide(hull: Hull, distances: Sequence[Callable[[Array], Array]]) -> list[Hu
         piece = Hull.from_shell(
             hull.voxel_m, hull.band_m, indices[near], sdf[near], hull.cameras, hull.rejected, who, hull.viewpoints
         )
-        pieces.append(largest_component(piece))
+        pieces.append(largest_component(replace(piece, views=hull.views)))
     return pieces
 
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import time
 from collections.abc import Mapping, Sequence
@@ -84,6 +85,8 @@ class PoseEstimator:
             if isinstance(found, NoPerson):
                 return found
             return describe_pose(found[0].state, hull, None, clock.stage_ms)
+        if hull.views is not None and others:
+            hull = dataclasses.replace(hull, views=hull.views.without(others))
         surface = extract_surface(hull)
         clock.lap("surface")
         if self.config.temporal:
@@ -128,7 +131,7 @@ class _Stopwatch:
 def _warm_up_room() -> tuple[Rig, HullConfig]:
     K = np.array([[120.0, 0.0, 79.5], [0.0, 120.0, 79.5], [0.0, 0.0, 1.0]])
     cameras = []
-    for i, (x, y) in enumerate(((3.0, 0.0), (0.0, 3.0), (-2.1, -2.1))):
+    for i, (x, y) in enumerate(((3.0, 0.0), (0.0, 3.0), (-2.1, -2.1), (-3.0, 0.0), (0.0, -3.0), (2.1, 2.1))):
         forward = -np.array([x, y, 0.0]) / np.hypot(x, y)
         down = np.array([0.0, 0.0, -1.0])
         T = np.eye(4)
@@ -141,6 +144,8 @@ def _warm_up_room() -> tuple[Rig, HullConfig]:
 def _warm_up_masks() -> dict[str, NDArray[np.uint8]]:
     mask = np.zeros((160, 160), np.uint8)
     mask[50:66, 73:87] = mask[66:110, 66:94] = mask[110:150, 68:78] = mask[110:150, 82:92] = 255
-    one_legged = mask.copy()  # so that mending is compiled as well
+    one_legged = mask.copy()  # so that mending is compiled as well, of what one mask misses and of what two miss
     one_legged[110:150, 82:92] = 0
-    return {"warm0": one_legged, "warm1": mask, "warm2": mask}
+    armless = mask.copy()
+    armless[66:110, 66:73] = 0
+    return {"warm0": one_legged, "warm1": armless, "warm2": mask, "warm3": armless, "warm4": mask, "warm5": mask}

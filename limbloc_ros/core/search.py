@@ -23,6 +23,7 @@ from limbloc_ros.core._figure_topology import SPHERES
 from limbloc_ros.core.directions import sphere_directions
 from limbloc_ros.core.figure import BONE, SPHERE, FigureState, Placed
 from limbloc_ros.core.hull import Hull
+from limbloc_ros.core.views import Views
 
 Array = NDArray[np.float64]
 
@@ -126,11 +127,13 @@ class TorsoSearch:
     Attributes:
         headings: tried for each pair of pelvis and skull, over half a turn.
         listed: best torsos that are kept of all pairs.
-        climbed, steps: so many different ones of these climb on, with so many random steps.
+        compared: so many different ones of these are compared with the silhouettes.
+        climbed, steps: so many of these climb on, with so many random steps.
     """
 
     headings: int = 6
     listed: int = 400
+    compared: int = 40
     climbed: int = 14
     steps: int = 240
 
@@ -170,34 +173,40 @@ def torso_hypotheses(
         return []
     found = found[np.argsort(found[:, 13], kind="stable")]
     spread = np.array([0.02] * 3 + [0.15] * 3 + [0.15] * 3 + [0.15] * 3 + [0.04])
+    starts = _distinct(found, effort.compared, 0.10, 0.4)
     climbed = []
-    for start in _distinct(found, effort.climbed, 0.10, 0.4):
+    for start in starts[np.argsort(_scores(starts, hull.views), kind="stable")[: effort.climbed]]:
         noise = rng.standard_normal((effort.steps, 13))
         climbed.append(
             torso_kernels.climb_torso(start, noise, *evidence, table.arrays, table.weights, table.n_solid, spread)
         )
     ranked = np.array(climbed)
-    ranked = ranked[np.argsort(ranked[:, 13], kind="stable")]
+    ranked = ranked[np.argsort(_scores(ranked, hull.views), kind="stable")]
     return [(_torso_state(pose), float(pose[13])) for pose in _distinct(ranked, keep, 0.08, 0.4)]
 
 
-def _distinct(poses: Array, most: int, apart_m: float, apart_rad: float) -> list[Array]:
-    """The first poses that differ from all before in place, or in axis or heading (modulo half a turn)."""
-    kept: list[tuple[Array, Array]] = []
-    for pose in poses:
-        R = exp_so3(pose[3:6])
-        same = False
-        for other, Q in kept:
-            axis = math.acos(min(1.0, max(-1.0, float(R[:, 2] @ Q[:, 2]))))
-            side = math.acos(min(1.0, abs(float(R[:, 1] @ Q[:, 1]))))
-            if np.linalg.norm(pose[:3] - other[:3]) < apart_m and max(axis, side) < apart_rad:
-                same = True
-                break
-        if not same:
-            kept.append((pose, R))
+def _scores(poses: Array, views: Views | None) -> Array:
+    """How badly torsos [N, 14] fit the hull, and the silhouettes, of which the trunk is the larger part."""
+    if views is None:
+        return poses[:, 13]
+    placed = [figure.place(_torso_state(pose)) for pose in poses]
+    seen = [views.mismatch(figure.PART_SPHERES[TRUNK_PARTS], torso.spheres, torso.radii) for torso in placed]
+    return np.asarray(poses[:, 13] + np.array(seen))
+
+
+def _distinct(poses: Array, most: int, apart_m: float, apart_rad: float) -> Array:
+    """The first poses [N, 14] that differ from all before in place, or in axis or heading (modulo half a turn)."""
+    kept: list[int] = []
+    turns = np.array([exp_so3(pose[3:6]) for pose in poses])
+    least = math.cos(apart_rad)
+    for n, (pose, R) in enumerate(zip(poses, turns, strict=True)):
+        near = ((poses[kept, :3] - pose[:3]) ** 2).sum(axis=1) < apart_m**2
+        alike = (turns[kept, :, 2] @ R[:, 2] > least) & (np.abs(turns[kept, :, 1] @ R[:, 1]) > least)
+        if not (near & alike).any():
+            kept.append(n)
             if len(kept) == most:
                 break
-    return [pose for pose, _ in kept]
+    return poses[kept]
 
 
 def _torso_state(pose: Array) -> FigureState:

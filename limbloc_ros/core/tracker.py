@@ -20,6 +20,7 @@ from limbloc_ros.core.engine_robust import (
     gather_evidence,
     make_scene,
     refine,
+    unseen,
     with_one_limb,
 )
 from limbloc_ros.core.figure import BONE, FigureState
@@ -111,13 +112,13 @@ class Tracker:
             judged = energy.system(result.state, evidence, self._firm).cost
             final = refine(result.state, evidence, self._weights, self.FINAL_STEPS, size)
             self._remember(final.state.shape)
-            fit = Fit(final.state, final.system, judged=judged)
+            fit = Fit(final.state, final.system, judged=judged, unseen=unseen(final.state, hull))
         if fit is None or self._doubts(fit.judged):
             self._last_scratch = self._frame
             # while there is a figure, a quick search first: what it misses is searched harder the next time
             searches = self._searches if fit is None or self._vain else self._searches[:1]
             scratch = fit_from_scratch(hull, surface, self._seed, self._weights, searches)
-            self._vain = scratch is None or (fit is not None and scratch.judged >= 0.95 * fit.judged)
+            self._vain = scratch is None or (fit is not None and scratch.verdict >= 0.95 * fit.verdict)
             if scratch is not None and not self._vain:
                 fit, self._wait = scratch, self.PATIENCE if scratch.judged < self.DOUBTFUL_COST else 1
                 self._size, self._sized = scratch.state.shape, 1
@@ -167,6 +168,9 @@ class Tracker:
                 for state in with_one_limb(result.state, scene, kind, side, places, QUICK.candidates):
                     settled = refine(state, scene.quick, scene.lenient, 5, size).state
                     other = refine(settled, evidence, self._firm, 8, size)
-                    if other.system.cost < self.BETTER * result.system.cost:
+                    if other.system.cost < result.system.cost + unseen(result.state, hull) and (
+                        other.system.cost + unseen(other.state, hull)
+                        < self.BETTER * (result.system.cost + unseen(result.state, hull))
+                    ):
                         result = other
         return result

@@ -4,12 +4,14 @@
 The hull's cloud holds the inside and a thin shell: per voxel its centre (`x y z`, so that RViz shows it as it is), the
 signed distance `sdf` in metres, and what rebuilds the exact grid of the offline path: the lattice indices `i j k`, the
 voxel size and the band in whole micrometres. `camera` numbers the camera whose silhouette cut the hull there, `vp_x
-vp_y vp_z` is where that camera stands. An empty cloud says that nobody is there.
+vp_y vp_z` is where that camera stands. `views` holds what the cameras saw, by which figures are judged: the number of
+its bytes and then these, four in each voxel's. An empty cloud says that nobody is there.
 """
 
 from __future__ import annotations
 
 from array import array
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -20,13 +22,29 @@ from std_msgs.msg import Header
 from limbloc_ros.core.errors import InputError
 from limbloc_ros.core.hull import NOBODY, Hull
 from limbloc_ros.core.surface import Surface
+from limbloc_ros.core.views import Views
 
 HULL_POINT = np.dtype(
     {
-        "names": ["x", "y", "z", "sdf", "i", "j", "k", "camera", "voxel_um", "band_um", "vp_x", "vp_y", "vp_z"],
-        "formats": ["<f4", "<f4", "<f4", "<f4", "<i2", "<i2", "<i2", "<u2", "<u4", "<u4", "<f4", "<f4", "<f4"],
-        "offsets": [0, 4, 8, 12, 16, 18, 20, 22, 24, 28, 32, 36, 40],
-        "itemsize": 44,
+        "names": [
+            "x",
+            "y",
+            "z",
+            "sdf",
+            "i",
+            "j",
+            "k",
+            "camera",
+            "voxel_um",
+            "band_um",
+            "vp_x",
+            "vp_y",
+            "vp_z",
+            "views",
+        ],
+        "formats": ["<f4", "<f4", "<f4", "<f4", "<i2", "<i2", "<i2", "<u2", "<u4", "<u4", "<f4", "<f4", "<f4", "<u4"],
+        "offsets": [0, 4, 8, 12, 16, 18, 20, 22, 24, 28, 32, 36, 40, 44],
+        "itemsize": 48,
     }
 )
 SURFACE_POINT = np.dtype(
@@ -97,6 +115,13 @@ def hull_to_cloud(hull: Hull, header: Header) -> PointCloud2:
         known = cut_by < len(hull.viewpoints)
         halves[:, 11] = np.where(known, cut_by, NOBODY)
         numbers[:, 8:11] = hull.viewpoints[np.where(known, cut_by, 0)]
+    words[:, 11] = 0
+    if hull.views is not None:
+        packed = hull.views.packed
+        padded = np.frombuffer(packed + bytes(-len(packed) % 4), "<u4")
+        if len(padded) < len(words):
+            words[0, 11] = len(packed)
+            words[1 : 1 + len(padded), 11] = padded
     points = words.view(HULL_POINT)[:, 0]
     return _cloud(points, _HULL_FIELDS, header)
 
@@ -144,14 +169,26 @@ def cloud_to_hull(msg: PointCloud2) -> Hull | None:
     if (camera > NOBODY).any():
         raise InputError(f"a hull's cloud numbers cameras up to {NOBODY} (nobody), got {int(camera.max())}")
     known = camera < NOBODY
+    views = _views(points["views"])
     if not known.any():
-        return Hull.from_shell(voxel_m, band_m, indices, sdf)
+        return replace(Hull.from_shell(voxel_m, band_m, indices, sdf), views=views)
     viewpoints = np.zeros((int(camera[known].max()) + 1, 3), np.float32)
     for axis in range(3):
         viewpoints[camera[known], axis] = points["vp_" + "xyz"[axis]][known]
     if not np.isfinite(viewpoints).all():
         raise InputError("the places of cameras (vp_x, vp_y, vp_z) in a hull's cloud must be finite")
-    return Hull.from_shell(voxel_m, band_m, indices, sdf, cut_by=camera.astype(np.uint8), viewpoints=viewpoints)
+    hull = Hull.from_shell(voxel_m, band_m, indices, sdf, cut_by=camera.astype(np.uint8), viewpoints=viewpoints)
+    return replace(hull, views=views)
+
+
+def _views(words: NDArray[np.uint32]) -> Views | None:
+    """The views that a cloud carries, if it does."""
+    count = int(words[0])
+    if count == 0:
+        return None
+    if count > 4 * (len(words) - 1):
+        raise InputError(f"a hull's cloud of {len(words)} points cannot hold views of {count} bytes")
+    return Views.unpacked(words[1 : 1 + -(-count // 4)].tobytes()[:count])
 
 
 def surface_to_cloud(surface: Surface, geodesic: NDArray[np.float64], header: Header) -> PointCloud2:

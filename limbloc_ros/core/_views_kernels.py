@@ -1,0 +1,203 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Numba kernels that draw a figure into coarse silhouettes; `views` documents them, they trust their caller."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from limbloc_ros.core._projection_kernels import project, row_start
+
+#: In cells: background, foreground, and what nobody is asked about.
+BARE, SEEN, UNASKED = 0, 1, 2
+#: Where a figure was drawn that covers whatever is drawn later.
+BODY = -1
+#: What this is near to a camera (m) is not drawn.
+CLOSEST = 0.1
+#: Nor what is seen so many cells off.
+FAR = 1e6
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def sample_cells(field: Any, boxes: Any, frames: Any, cells: Any) -> None:
+    """Fill cells (uint8, laid out as `frames` [C, 6] says) with whether the distance field is negative at each one's
+    centre; what lies beyond a camera's piece of the field is background."""
+    for c in range(len(frames)):
+        left, top, width, height, step, offset = frames[c]
+        x0, y0, columns, rows, begin = boxes[c]
+        for j in range(height):
+            y = top + j * step + step // 2 - y0
+            for i in range(width):
+                x = left + i * step + step // 2 - x0
+                inside = x >= 0 and y >= 0 and x < columns and y < rows and field[begin + y * columns + x] < 0.0
+                cells[offset + j * width + i] = SEEN if inside else BARE
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def mark_points(points: Any, cams: Any, frames: Any, marks: Any) -> None:
+    """Set to 1 the cells in which points [P, 3] m are seen."""
+    for c in range(len(frames)):
+        left, top, width, height, step, offset = frames[c]
+        for n in range(len(points)):
+            u, v, depth = project(cams, c, row_start(cams, c, points[n, 0], points[n, 1]), points[n, 2])
+            if depth <= 0.0:
+                continue
+            i = math.floor((u + 0.5 - left) / step)
+            j = math.floor((v + 0.5 - top) / step)
+            if i >= 0 and j >= 0 and i < width and j < height:
+                marks[offset + j * width + i] = 1
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def _widen(span: Any, row: int, x: float) -> None:
+    span[row, 0] = min(span[row, 0], x)
+    span[row, 1] = max(span[row, 1], x)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def _disc(x: float, y: float, r: float, height: int, span: Any) -> None:
+    for row in range(max(0, math.ceil(y - r)), min(height - 1, math.floor(y + r)) + 1):
+        half = math.sqrt(max(0.0, r * r - (row - y) * (row - y)))
+        _widen(span, row, x - half)
+        _widen(span, row, x + half)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def _segment(x0: float, y0: float, x1: float, y1: float, height: int, span: Any) -> None:
+    if y0 > y1:
+        x0, y0, x1, y1 = x1, y1, x0, y0
+    slope = (x1 - x0) / (y1 - y0) if y1 > y0 else 0.0
+    for row in range(max(0, math.ceil(y0)), min(height - 1, math.floor(y1)) + 1):
+        _widen(span, row, x0 + slope * (row - y0))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def _tangents(x0: float, y0: float, r0: float, x1: float, y1: float, r1: float, height: int, span: Any) -> None:
+    """The two outer tangents of two discs; none if one lies in the other."""
+    dx, dy = x1 - x0, y1 - y0
+    square = dx * dx + dy * dy
+    if square <= (r1 - r0) * (r1 - r0) or square < 1e-12:
+        return
+    along = (r0 - r1) / square
+    across = math.sqrt(max(0.0, square - (r1 - r0) * (r1 - r0))) / square
+    for sign in (-1.0, 1.0):
+        nx = along * dx - sign * across * dy
+        ny = along * dy + sign * across * dx
+        _segment(x0 + r0 * nx, y0 + r0 * ny, x1 + r1 * nx, y1 + r1 * ny, height, span)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def see_balls(centres: Any, radii: Any, cams: Any, c: int, frame: Any, discs: Any) -> None:
+    """Place and radius in one camera's cells, whose centres are whole numbers, to discs [S, 3]; radius -1: not seen."""
+    left, top, _, _, step, _ = frame
+    focal = math.sqrt(cams[c, 12] * cams[c, 13])
+    for n in range(len(centres)):
+        u, v, depth = project(cams, c, row_start(cams, c, centres[n, 0], centres[n, 1]), centres[n, 2])
+        discs[n, 0] = (u - left - step // 2) / step
+        discs[n, 1] = (v - top - step // 2) / step
+        discs[n, 2] = radii[n] * focal / (depth * step) if depth > CLOSEST else -1.0
+        if not (abs(discs[n, 0]) < FAR and abs(discs[n, 1]) < FAR and discs[n, 2] < FAR):
+            discs[n, 2] = -1.0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def draw_parts(parts: Any, discs: Any, frame: Any, span: Any, cells: Any, drawn: Any, mark: int) -> tuple[int, int]:
+    """Write `mark` to the cells of one camera whose centres the parts cover, but where `drawn` is BODY.
+
+    A part is the convex hull of three balls; here that of the three discs that the balls are seen as, row by row: its
+    outermost points there lie on a disc or on an outer tangent of two.
+
+    Returns how many of the newly marked cells are foreground, and background.
+    """
+    _, _, width, height, _, offset = frame
+    seen, bare = 0, 0
+    for p in range(len(parts)):
+        a, b, d = parts[p]
+        if min(discs[a, 2], discs[b, 2], discs[d, 2]) < 0.0:
+            continue
+        low, high = math.inf, -math.inf
+        for n in (a, b, d):
+            low = min(low, discs[n, 1] - discs[n, 2])
+            high = max(high, discs[n, 1] + discs[n, 2])
+        first = max(0, math.ceil(min(low, float(height))))
+        last = min(height - 1, math.floor(max(high, -1.0)))
+        for row in range(first, last + 1):
+            span[row, 0] = math.inf
+            span[row, 1] = -math.inf
+        for m, n in ((a, b), (b, d), (d, a)):
+            if m == n:
+                continue
+            _disc(discs[m, 0], discs[m, 1], discs[m, 2], height, span)
+            _tangents(
+                discs[m, 0], discs[m, 1], discs[m, 2], discs[n, 0], discs[n, 1], discs[n, 2], height, span
+            )  # fmt: skip
+        if a == b and b == d:
+            _disc(discs[a, 0], discs[a, 1], discs[a, 2], height, span)
+        for row in range(first, last + 1):
+            begin = math.ceil(max(span[row, 0], 0.0))
+            end = math.floor(min(span[row, 1], width - 1.0))
+            for at in range(offset + row * width + begin, offset + row * width + end + 1):
+                if drawn[at] != mark and drawn[at] != BODY:
+                    drawn[at] = mark
+                    if cells[at] == BARE:
+                        bare += 1
+                    elif cells[at] == SEEN:
+                        seen += 1
+    return seen, bare
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def draw(parts: Any, centres: Any, radii: Any, cams: Any, frames: Any, cells: Any, drawn: Any) -> Any:
+    """Write BODY (int16) to the cells whose centres a figure covers.
+
+    Returns how many of these are foreground, and background, in every camera; int64 [C, 2].
+    """
+    discs = np.empty((len(centres), 3))
+    span = np.empty((max(1, frames[:, 3].max()), 2))
+    counts = np.empty((len(frames), 2), np.int64)
+    for c in range(len(frames)):
+        see_balls(centres, radii, cams, c, frames[c], discs)
+        counts[c, 0], counts[c, 1] = draw_parts(parts, discs, frames[c], span, cells, drawn, BODY)
+    return counts
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def draw_limbs(
+    parts: Any, limbs: Any, centres: Any, radii: Any, cams: Any, frames: Any, cells: Any, drawn: Any, asked: Any,
+    covers: Any, bare: Any,
+) -> None:  # fmt: skip
+    """What each of many places of a limb covers beside the body.
+
+    Args:
+        parts: [P, 3] the limb's, which may share balls with the body.
+        limbs: [S] which of the balls move with the limb.
+        centres: [M, S, 3] where these are in each place, m.
+        radii: [S_all, 4] radius and place of every ball of the figure, m.
+        cams, frames, cells: see `views.Views`.
+        drawn: int16, BODY where the rest of the figure is, 0 elsewhere; is written to.
+        asked: [Q] indices of cells.
+        covers: bool [M, Q] out: whether the limb covers them.
+        bare: int64 [C, M] out: how many cells of background.
+    """
+    discs = np.empty((len(radii), 3))
+    moved = np.empty((len(limbs), 3))
+    limb_radii = radii[limbs, 0].copy()
+    span = np.empty((max(1, frames[:, 3].max()), 2))
+    q = 0
+    for c in range(len(frames)):
+        see_balls(radii[:, 1:], radii[:, 0], cams, c, frames[c], discs)
+        begin = q
+        end = frames[c, 5] + frames[c, 2] * frames[c, 3]
+        while q < len(asked) and asked[q] < end:
+            q += 1
+        for m in range(len(centres)):
+            see_balls(centres[m], limb_radii, cams, c, frames[c], moved)
+            for n in range(len(limbs)):
+                for i in range(3):
+                    discs[limbs[n], i] = moved[n, i]
+            _, bare[c, m] = draw_parts(parts, discs, frames[c], span, cells, drawn, m + 1)
+            for n in range(begin, q):
+                covers[m, n] = drawn[asked[n]] == m + 1

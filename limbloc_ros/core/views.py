@@ -1,0 +1,219 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What every camera saw of the person, coarsely: the judge of figures that explain a hull equally well.
+
+A hull keeps of all silhouettes only the most cautious: where one mask lost an arm, or is ragged, that mask alone
+decides. The silhouettes themselves still say what all others saw. So a figure is drawn into every camera, and the area
+that it and the silhouette do not share is measured: eq. 2 of the paper, in the images instead of the volume.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from limbloc_ros.core import _projection_kernels as projection
+from limbloc_ros.core import _views_kernels as kernels
+from limbloc_ros.core.errors import InputError
+from limbloc_ros.core.pose import Flesh
+from limbloc_ros.core.silhouettes import Silhouettes
+
+Array = NDArray[np.float64]
+
+#: Edge of a cell at the person's distance, m: an arm is seven cells wide. Never less than a pixel.
+CELL_M = 0.012
+#: So far beyond the silhouette a figure that leaves it is still counted, m.
+MARGIN_M = 0.2
+#: More than these are no views.
+MOST_CAMERAS, MOST_CELLS = 255, 4_000_000
+
+
+@dataclass(frozen=True)
+class Views:
+    """The silhouettes of one frame in coarse cells, and the cameras that saw them.
+
+    Attributes:
+        cameras: float64 [C, 35] packed table (see `_projection_kernels`).
+        frames: int64 [C, 6] for each camera first column and row (px), cells across and down, edge of a cell (px), and
+            the first cell in `cells`.
+        cells: uint8, row by row and camera after camera: 0 background, 1 foreground, 2 not asked about.
+    """
+
+    cameras: Array
+    frames: NDArray[np.int64]
+    cells: NDArray[np.uint8]
+
+    @staticmethod
+    def of(silhouettes: Silhouettes, points: Array) -> Views:
+        """The silhouettes' blobs that hold some of the hull.
+
+        Args:
+            silhouettes: as they were carved with.
+            points: [P, 3] m, some points in the hull.
+        """
+        cameras = silhouettes.cameras
+        frames = np.zeros((len(cameras), 6), np.int64)
+        middle = points.mean(axis=0)
+        count = 0
+        for c, (x, y, width, height, _) in enumerate(silhouettes.counts.frames):
+            depth = max(0.5, float(cameras[c, 6:9] @ middle + cameras[c, 11]))
+            step = max(1, round(CELL_M * cameras[c, 12] / depth))
+            margin = int(np.ceil(MARGIN_M * cameras[c, 12] / depth))
+            left, top = max(0, int(x) - margin), max(0, int(y) - margin)
+            right = min(int(cameras[c, 31]), int(x + width) + margin)
+            bottom = min(int(cameras[c, 32]), int(y + height) + margin)
+            frames[c] = left, top, max(0, right - left) // step, max(0, bottom - top) // step, step, count
+            count += int(frames[c, 2] * frames[c, 3])
+        cells = np.empty(count, np.uint8)
+        kernels.sample_cells(silhouettes.field, silhouettes.boxes, frames, cells)
+        marks = np.zeros(count, np.uint8)
+        kernels.mark_points(points, cameras, frames, marks)
+        for image, held in zip(_images(frames, cells), _images(frames, marks), strict=True):
+            if image.size:
+                _, blobs = cv2.connectedComponents(image, connectivity=8)
+                kept = np.zeros(int(blobs.max()) + 1, np.uint8)
+                kept[blobs[held > 0]] = 1
+                kept[0] = 0
+                image[:] = kept[blobs]
+        return Views(cameras, frames, cells)._cropped()
+
+    def _cropped(self) -> Views:
+        """The same with no more than a margin around each silhouette."""
+        frames, images = self.frames.copy(), []
+        count = 0
+        for frame, image in zip(frames, _images(self.frames, self.cells), strict=True):
+            x, y, width, height = cv2.boundingRect(image) if image.size else (0, 0, 0, 0)
+            margin = round(MARGIN_M / CELL_M)
+            left, top = max(0, x - margin), max(0, y - margin)
+            part = image[top : y + height + margin, left : x + width + margin] if width else image[:0, :0]
+            frame[0] += left * frame[4]
+            frame[1] += top * frame[4]
+            frame[2], frame[3], frame[5] = part.shape[1], part.shape[0], count
+            count += part.size
+            images.append(part.ravel())
+        return Views(self.cameras, frames, np.concatenate(images) if images else self.cells)
+
+    def without(self, others: Sequence[Flesh]) -> Views:
+        """The same without what other people explain of the silhouettes: nobody is asked about that."""
+        cells = self.cells.copy()
+        for body in others:
+            drawn = self.drawn(body.parts, body.centres, body.radii)
+            cells[(drawn != 0) & (cells == kernels.SEEN)] = kernels.UNASKED
+        return replace(self, cells=cells)
+
+    @cached_property
+    def packed(self) -> bytes:
+        """All of it in few bytes; `unpacked` makes the very same of them. Not of what is `without` somebody."""
+        shape = np.array([len(self.cameras), len(self.cells)], "<u4")
+        numbers = self.cameras.astype("<f8").tobytes() + self.frames.astype("<i8").tobytes()
+        return shape.tobytes() + zlib.compress(numbers + np.packbits(self.cells == kernels.SEEN).tobytes(), 1)
+
+    @staticmethod
+    def unpacked(data: bytes) -> Views:
+        """What was `packed`.
+
+        Raises:
+            InputError: these bytes are no views.
+        """
+        if len(data) < 8:
+            raise InputError(f"packed views have 8 bytes or more, got {len(data)}")
+        count, size = (int(n) for n in np.frombuffer(data[:8], "<u4"))
+        columns = projection.CAMERA_COLUMNS
+        expected = count * 8 * (columns + 6) + (size + 7) // 8
+        if count > MOST_CAMERAS or size > MOST_CELLS:
+            raise InputError(
+                f"expected views of at most {MOST_CAMERAS} cameras and {MOST_CELLS} cells, got {count} and {size}"
+            )
+        reader = zlib.decompressobj()
+        try:
+            found = reader.decompress(data[8:], expected + 1)
+        except zlib.error as error:
+            raise InputError(f"packed views cannot be read: {error}") from error
+        if len(found) != expected or not reader.eof or reader.unused_data:
+            raise InputError(f"views of {count} cameras and {size} cells need {expected} bytes; others were packed")
+        cut = count * 8 * columns
+        cameras = np.frombuffer(found[:cut], "<f8").reshape(count, columns).copy()
+        frames = np.frombuffer(found[cut : cut + count * 48], "<i8").reshape(count, 6).copy()
+        cells = np.unpackbits(np.frombuffer(found[cut + count * 48 :], np.uint8), count=size)
+        _check(cameras, frames, size)
+        return Views(cameras, frames, cells)
+
+    def drawn(self, parts: NDArray[np.int64], centres: Array, radii: Array) -> NDArray[np.int16]:
+        """Which cells a figure of parts [P, 3] over balls (centres [S, 3], radii [S], m) covers."""
+        return self._draw(parts, centres, radii)[0]
+
+    def _draw(
+        self, parts: NDArray[np.int64], centres: Array, radii: Array
+    ) -> tuple[NDArray[np.int16], NDArray[np.int64]]:
+        out = np.zeros(len(self.cells), np.int16)
+        counts = kernels.draw(parts, centres, radii, self.cameras, self.frames, self.cells, out)
+        return out, counts
+
+    def mismatch(self, parts: NDArray[np.int64], centres: Array, radii: Array) -> float:
+        """Area that the figure and the silhouettes do not share over that of the silhouettes; mean of the cameras."""
+        _, counts = self._draw(parts, centres, radii)
+        return float(self.worth @ (self.sizes - counts[:, 0] + counts[:, 1]))
+
+    @cached_property
+    def sizes(self) -> NDArray[np.int64]:
+        """[C] cells of each silhouette."""
+        return np.array([np.count_nonzero(image == kernels.SEEN) for image in _images(self.frames, self.cells)])
+
+    @cached_property
+    def worth(self) -> Array:
+        """[C] what one cell of each camera counts in the mismatch."""
+        seen = self.sizes > 0
+        return np.asarray(np.where(seen, 1.0 / np.maximum(self.sizes, 1), 0.0) / max(np.count_nonzero(seen), 1))
+
+    def open_cells(self, body: NDArray[np.int16], most: int) -> tuple[NDArray[np.int64], Array]:
+        """Some cells of the silhouettes that a body, as it was `drawn`, leaves open, and what each stands for."""
+        asked = np.flatnonzero((self.cells == kernels.SEEN) & (body == 0))
+        every = -(-len(asked) // most) or 1
+        asked = asked[every // 2 :: every]
+        return asked, self.worth[np.searchsorted(self.frames[:, 5], asked, side="right") - 1] * every
+
+    def limbs(
+        self, parts: NDArray[np.int64], moving: NDArray[np.int64], placed: Array, balls: Array,
+        body: NDArray[np.int16], asked: NDArray[np.int64],
+    ) -> tuple[NDArray[np.bool_], Array]:  # fmt: skip
+        """What a limb explains of the silhouettes beside the body, and what it covers of background, in many places.
+
+        Args:
+            parts: [P, 3] the limb's.
+            moving: [S] balls that move with it.
+            placed: [M, S, 3] where these are in each place, m.
+            balls: [S_all, 4] radius and place of all balls, m.
+            body: the rest of the figure as it was `drawn`.
+            asked: [Q] indices of cells.
+
+        Returns:
+            bool [M, Q] whether a limb covers these cells, and [M] the mismatch that it adds on the background.
+        """
+        covers = np.zeros((len(placed), len(asked)), np.bool_)
+        bare = np.zeros((len(self.frames), len(placed)), np.int64)
+        kernels.draw_limbs(
+            parts, moving, placed, balls, self.cameras, self.frames, self.cells, body.copy(), asked, covers, bare
+        )
+        return covers, self.worth @ bare
+
+
+def _check(cameras: Array, frames: NDArray[np.int64], size: int) -> None:
+    """Raise InputError where the kernels could read or draw beside the cells."""
+    _, _, width, height, step, offset = frames.T
+    fair = (np.abs(frames) < MOST_CELLS).all() and (frames[:, :4] >= 0).all() and (step > 0).all()
+    cells = width * height
+    if not fair or (offset != np.cumsum(cells) - cells).any() or int(cells.sum()) != size:
+        raise InputError("the frames of packed views do not fit their cells")
+    if not (np.abs(cameras) < 1e9).all() or (cameras[:, 12:14] <= 0).any() or (cameras[:, 31:33] < 2).any():
+        raise InputError(
+            "packed views hold a camera that cannot be: expected finite numbers and a focal length above 0"
+        )
+
+
+def _images(frames: NDArray[np.int64], cells: NDArray[np.uint8]) -> list[NDArray[np.uint8]]:
+    return [cells[offset : offset + width * height].reshape(height, width) for _, _, width, height, _, offset in frames]

@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A figure drawn into the cameras against the silhouettes: balls whose images are known, and their convex hulls."""
+
+import dataclasses
+from functools import cache
+
+import numpy as np
+import pytest
+from camera_rings import LENSES, ball_masks, ring
+
+from limbloc_ros.core.config import HullConfig
+from limbloc_ros.core.errors import InputError
+from limbloc_ros.core.hull import Hull, carve
+from limbloc_ros.core.pose import Flesh
+from limbloc_ros.core.silhouettes import pack_cameras
+from limbloc_ros.core.views import Views
+
+CENTRE, RADIUS = np.array([[0.0, 0.1, 1.0]]), np.array([0.4])
+BALL = np.array([[0, 0, 0]])
+
+
+@cache
+def views_of(*balls, count=4):
+    rig = ring(count, focal=140.0, size=(192, 144))
+    hull = carve(ball_masks(rig, list(balls)), rig, HullConfig(min_voxels=1))
+    assert isinstance(hull, Hull)
+    assert hull.views is not None
+    return hull.views
+
+
+def one_ball():
+    return views_of((tuple(CENTRE[0]), float(RADIUS[0])))
+
+
+def test_a_ball_covers_its_own_silhouettes():
+    views = one_ball()
+    assert (views.sizes > 100).all()
+    # A ball off the axis is seen as an ellipse, and drawn as a disc; cells along the outline may be either.
+    assert views.mismatch(BALL, CENTRE, RADIUS) < 0.08
+
+
+def test_worked_by_hand_what_is_missed_and_what_is_too_much():
+    views = one_ball()
+    nothing = views.mismatch(BALL, CENTRE + np.array([0.0, 0.0, 50.0]), RADIUS)
+    assert nothing == pytest.approx(1.0)
+    half = views.mismatch(BALL, CENTRE, 0.5**0.5 * RADIUS)
+    assert half == pytest.approx(0.5, abs=0.03)
+    more = views.mismatch(BALL, CENTRE, 1.2 * RADIUS)
+    assert more == pytest.approx(1.2**2 - 1.0, abs=0.08)
+
+
+@pytest.mark.parametrize("lens", LENSES[:2] + LENSES[5:7], ids=lambda lens: f"{lens[0]} {len(lens[1])}")
+def test_a_part_is_the_convex_hull_of_its_balls(lens):
+    """Against many balls between the three, each drawn by itself."""
+    rng = np.random.default_rng(3)
+    rig = ring(3, focal=210.0, size=(288, 216), lens=lens)
+    frames = np.array([[0, 0, 288, 216, 1, 288 * 216 * c] for c in range(3)])
+    views = Views(pack_cameras(rig), frames, np.zeros(3 * 288 * 216, np.uint8))
+    shares = np.array([(a, b, 24 - a - b) for a in range(25) for b in range(25 - a)]) / 24
+    for _ in range(8):
+        centres = np.array([0.0, 0.0, 1.0]) + rng.uniform(-0.3, 0.3, (3, 3))
+        radii = rng.uniform(0.03, 0.2, 3)
+        drawn = views.drawn(np.array([[0, 1, 2]]), centres, radii) != 0
+        balls = np.repeat(np.arange(len(shares))[:, None], 3, axis=1)
+        expected = views.drawn(balls, shares @ centres, shares @ radii) != 0
+        assert expected.sum() > 300
+        assert np.count_nonzero(drawn != expected) < 0.05 * expected.sum()
+
+
+def test_a_limb_is_asked_as_the_whole_figure_is():
+    """What a limb explains beside a body, and covers of background, is what the mismatch falls and rises by."""
+    centres = np.array([[0.0, 0.0, 1.0], [0.3, 0.0, 1.0], [0.6, 0.1, 1.1]])
+    radii = np.array([0.25, 0.1, 0.08])
+    views = views_of(((0.0, 0.0, 1.0), 0.25), ((0.35, 0.0, 1.0), 0.12))
+    body, limb = np.array([[0, 0, 0]]), np.array([[1, 2, 2]])
+    drawn = views.drawn(body, centres, radii)
+    asked, weights = views.open_cells(drawn, 1_000_000)
+    places = centres[1:] + np.array([[0.0, 0.0, 0.0], [0.0, 0.1, -0.1], [-0.5, 0.0, 0.0]])[:, None]
+    balls = np.column_stack([radii, centres])
+    covers, bare = views.limbs(limb, np.array([1, 2]), places, balls, drawn, asked)
+    for m, place in enumerate(places):
+        both = views.mismatch(np.vstack([body, limb]), np.vstack([centres[:1], place]), radii)
+        alone = views.mismatch(body, centres, radii)
+        assert both == pytest.approx(alone - weights[covers[m]].sum() + bare[m], abs=1e-12)
+    assert covers[0].sum() > covers[2].sum()
+    some, share = views.open_cells(drawn, 40)
+    assert len(some) <= 40
+    assert share.sum() == pytest.approx(weights.sum(), rel=0.1)
+
+
+def test_nobody_is_asked_about_others():
+    views = views_of(((-0.35, 0.0, 1.0), 0.25), ((0.35, 0.1, 1.0), 0.25))
+    first, second = np.array([[-0.35, 0.0, 1.0]]), np.array([[0.35, 0.1, 1.0]])
+    radius = np.array([0.25])
+    assert views.mismatch(BALL, first, radius) > 0.3
+    other = Flesh(second, 1.1 * radius, BALL, ())
+    assert views.without([other]).mismatch(BALL, first, radius) < 0.18
+
+
+def test_packed_and_unpacked_they_are_the_same():
+    views = one_ball()
+    again = Views.unpacked(views.packed)
+    for name in ("cameras", "frames", "cells"):
+        assert getattr(again, name).tobytes() == getattr(views, name).tobytes()
+        assert getattr(again, name).dtype == getattr(views, name).dtype
+    assert again.mismatch(BALL, CENTRE, RADIUS) == views.mismatch(BALL, CENTRE, RADIUS)
+
+
+def test_what_no_views_pack_is_refused():
+    views = one_ball()
+    data = views.packed
+    frames, cameras = views.frames.copy(), views.cameras.copy()
+    frames[0, 2] += 1
+    cameras[0, 0] = np.nan
+    for broken in (
+        b"",
+        data[:7],
+        data[:-1],
+        data + b"\0",
+        b"\xff" * 4 + data[4:],
+        data[:4] + b"\xff" * 4 + data[8:],
+        dataclasses.replace(views, frames=frames).packed,
+        dataclasses.replace(views, cameras=cameras).packed,
+    ):
+        with pytest.raises(InputError):
+            Views.unpacked(broken)
