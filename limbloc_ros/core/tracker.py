@@ -118,7 +118,7 @@ class Tracker:
             # while there is a figure, a quick search first: what it misses is searched harder the next time
             searches = self._searches if fit is None or self._vain else self._searches[:1]
             scratch = fit_from_scratch(hull, surface, self._seed, self._weights, searches)
-            self._vain = scratch is None or (fit is not None and scratch.verdict >= 0.95 * fit.verdict)
+            self._vain = scratch is None or (fit is not None and scratch.verdict >= fit.verdict - 0.05 * fit.judged)
             if scratch is not None and not self._vain:
                 fit, self._wait = scratch, self.PATIENCE if scratch.judged < self.DOUBTFUL_COST else 1
                 self._size, self._sized = scratch.state.shape, 1
@@ -168,9 +168,8 @@ class Tracker:
                 for state in with_one_limb(result.state, scene, kind, side, places, QUICK.candidates):
                     settled = refine(state, scene.quick, scene.lenient, 5, size).state
                     other = refine(settled, evidence, self._firm, 8, size)
-                    if other.system.cost < result.system.cost + unseen(result.state, hull) and (
-                        other.system.cost + unseen(other.state, hull)
-                        < self.BETTER * (result.system.cost + unseen(result.state, hull))
-                    ):
+                    gain = result.system.cost - other.system.cost
+                    gain += unseen(result.state, hull) - unseen(other.state, hull)
+                    if gain > (1.0 - self.BETTER) * result.system.cost:
                         result = other
         return result
