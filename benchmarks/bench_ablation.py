@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What each replacement bought: from the paper's engine to ours, one step at a time, on the public suites.
 
-    python benchmarks/bench_ablation.py [--every N] [--steps 1-7]
+    python benchmarks/bench_ablation.py [--every N] [--steps 1-10]
 
 Every frame is fitted alone, from the same hull, by each step's engine; one thread. Columns: median distance of the 13
 limb joints in mm and, after the slash, the frames with all of them within 15 cm in %, per suite; then the median
@@ -38,9 +38,10 @@ from limbloc_ros.core.energy import Weights  # noqa: E402
 from limbloc_ros.core.engine_robust import QUICK, SEARCHES, Effort  # noqa: E402
 from limbloc_ros.core.errors import NoPerson  # noqa: E402
 from limbloc_ros.core.figure import FigureState, place  # noqa: E402
-from limbloc_ros.core.hull import Hull, largest_component  # noqa: E402
+from limbloc_ros.core.hull import Hull, evaluate, largest_component  # noqa: E402
 from limbloc_ros.core.pipeline import Carver  # noqa: E402
 from limbloc_ros.core.pose import JOINT_NAMES  # noqa: E402
+from limbloc_ros.core.silhouettes import measure_silhouettes, pack_cameras  # noqa: E402
 from limbloc_ros.core.surface import extract_surface  # noqa: E402
 from limbloc_ros.recordings.cases import Case, load_case  # noqa: E402
 
@@ -90,7 +91,28 @@ def searched(*searches: Effort) -> Callable[[Hull], FigureState | None]:
     return fit
 
 
-VOTING, PLAIN = HullConfig(), HullConfig(repair_depth_m=0.0)
+CONFIG = HullConfig()
+
+
+def voted(case: Case, frame: int) -> Hull | None:
+    """The hull of cameras that may be outvoted, and what they saw."""
+    found = Carver(case.rig, CONFIG).carve(case.masks(frame))
+    return None if isinstance(found, NoPerson) else largest_component(found)
+
+
+def blindly_voted(case: Case, frame: int) -> Hull | None:
+    """The same hull, without the silhouettes by which figures are judged."""
+    found = voted(case, frame)
+    return None if found is None else dataclasses.replace(found, views=None)
+
+
+def intersected(case: Case, frame: int) -> Hull | None:
+    """The paper's hull: what no camera denies."""
+    silhouettes = measure_silhouettes(case.masks(frame), case.rig, pack_cameras(case.rig), CONFIG)
+    indices, distance, _, _ = evaluate(silhouettes, CONFIG.band_m, keep_second=False)
+    if not (distance < 0).any():
+        return None
+    return largest_component(Hull.from_shell(CONFIG.voxel_m, CONFIG.band_m, indices, distance))
 
 
 @dataclass(frozen=True)
@@ -99,34 +121,37 @@ class Step:
 
     title: str
     fit: Callable[[Hull], FigureState | None]
-    hull: HullConfig = VOTING
+    carve: Callable[[Case, int], Hull | None] = blindly_voted
 
 
 PAPER = Paper()
 _SEVERAL = dataclasses.replace(QUICK, single_arms=0, single_legs=0, rounds=0, enough=0.0)
 STEPS = (
-    Step("`paper`, hull by plain intersection", PAPER.fit, PLAIN),
+    Step("`paper`, hull by plain intersection", PAPER.fit, intersected),
     Step("`paper`, hull by voting", PAPER.fit),
     Step("+ least squares on our energy after its simplex", PAPER.fit_and_go_on),
     Step("our search in the place of its anchor points: one torso, one pair of legs, one of arms", searched(SIMPLEST)),
     Step("+ more torsos, pairs of legs and of arms", searched(_SEVERAL)),
     Step("+ each limb of the winner tried elsewhere", searched(dataclasses.replace(QUICK, enough=0.0))),
     Step("+ a second search while the energy is high", searched(*SEARCHES[:2])),
-    Step("+ a third, and loose clothes: `robust`", searched(*SEARCHES)),
-    Step("`robust`, hull by plain intersection", searched(*SEARCHES), PLAIN),
+    Step("+ a third, and loose clothes", searched(*SEARCHES)),
+    Step("+ figures judged by the silhouettes: `robust`", searched(*SEARCHES), voted),
+    Step("`robust`, hull by plain intersection", searched(*SEARCHES), intersected),
 )
 
 
-def frames(data: Path, suite: str, every: int) -> Iterator[tuple[Callable[[HullConfig], Hull | None], Array]]:
+Carve = Callable[[Case, int], Hull | None]
+
+
+def frames(data: Path, suite: str, every: int) -> Iterator[tuple[Callable[[Carve], Hull | None], Array]]:
     """Every so many frames of a suite: what carves it, and the true joints [13, 3]."""
     for folder in sorted(folder for folder in (data / suite).iterdir() if (folder / "calib.json").is_file()):
         case = load_case(folder)
         for frame in range(0, len(case), every):
 
             @functools.cache
-            def hull(config: HullConfig, case: Case = case, frame: int = frame) -> Hull | None:
-                found = Carver(case.rig, config).carve(case.masks(frame))
-                return None if isinstance(found, NoPerson) else largest_component(found)
+            def hull(carve: Carve, case: Case = case, frame: int = frame) -> Hull | None:
+                return carve(case, frame)
 
             yield hull, np.stack([case.truth[name][frame] for name in LIMB13])
 
@@ -139,7 +164,7 @@ def fit_all(steps: Sequence[Step], data: Path, every: int) -> list[str]:
         errors: list[list[Array]] = [[] for _ in steps]
         for carve, truth in tqdm(frames(data, suite, every), desc=suite, unit="frame", disable=None):
             for n, step in enumerate(steps):
-                hull = carve(step.hull)
+                hull = carve(step.carve)
                 started = time.process_time()
                 state = None if hull is None else step.fit(hull)
                 times[n].append(1e3 * (time.process_time() - started))
