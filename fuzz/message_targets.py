@@ -122,7 +122,7 @@ def _cloud_with_views() -> bytes:
 
     camera = np.zeros((1, 35))
     camera[0, [0, 4, 8]], camera[0, 11:16], camera[0, 31:33] = 1.0, (3.0, 100.0, 100.0, 32.0, 24.0), (64.0, 48.0)
-    views = Views(camera, np.array([[8, 8, 8, 6, 2, 0]]), np.arange(48, dtype=np.uint8) % 2)
+    views = Views(camera, np.array([[8, 8, 8, 6, 2, 0]]), np.arange(48, dtype=np.uint8) % 3)
     indices = np.stack(np.unravel_index(np.arange(100), (5, 5, 4)), axis=1).astype(np.int32)
     hull = Hull.from_shell(0.02, 0.06, indices, np.full(100, -0.02, np.float32))
     return bytes(hull_to_cloud(replace(hull, views=views), Header()).data)

@@ -177,7 +177,7 @@ def overwritten(offset: int, value: bytes) -> PointCloud2:
         (overwritten(22, struct.pack("<HIIf", 3, 100_000, 60_000, float("nan"))), "vp_x, vp_y, vp_z.*finite"),
         (overwritten(44, struct.pack("<I", 4_000_000_000)), "cannot hold views of 4000000000 bytes"),
         (overwritten(44, struct.pack("<I", 5)), "8 bytes or more"),
-        (overwritten(44, struct.pack("<I", 40)), "cannot be read"),
+        (overwritten(44, struct.pack("<I", 40)), "1 to 255 cameras .* got 0 and 0"),
         (overwritten(22, struct.pack("<HIIfff", 0, 100_000, 60_000, 1.0, 2.0, float("-inf"))), "finite"),
     ],
 )

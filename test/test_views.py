@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from camera_rings import LENSES, ball_masks, ring
 
+from limbloc_ros.core import _views_kernels as kernels
+from limbloc_ros.core import views as views_module
 from limbloc_ros.core.config import HullConfig
 from limbloc_ros.core.errors import InputError
 from limbloc_ros.core.hull import Hull, carve
@@ -97,8 +99,71 @@ def test_nobody_is_asked_about_others():
     assert views.without([other]).mismatch(BALL, first, radius) < 0.18
 
 
-def test_packed_and_unpacked_they_are_the_same():
+def test_a_camera_that_sees_hardly_anything_decides_hardly_anything():
+    """Of a person whom another hides but for a rim, the rim of the figure beside it is not the whole mismatch."""
     views = one_ball()
+    cells = views.cells.copy()
+    first = np.flatnonzero(cells[: views.frames[1, 5]] == kernels.SEEN)
+    cells[first[3:]] = kernels.UNASKED
+    rim = dataclasses.replace(views, cells=cells)
+    assert rim.sizes[0] == 3
+    assert rim.mismatch(BALL, CENTRE, 1.1 * RADIUS) < 4.0 * views.mismatch(BALL, CENTRE, 1.1 * RADIUS)
+
+
+def test_nobody_is_asked_about_ignored_regions():
+    """Their pixels are foreground when the hull is carved, but nobody saw a person there."""
+    balls = [(tuple(CENTRE[0]), float(RADIUS[0]))]
+    rig = ring(4, focal=140.0, size=(192, 144))
+    masks = ball_masks(rig, balls)
+    left, bottom = np.array([[-1, -1], [80, -1], [80, 200], [-1, 200]]), np.array([[0, 100], [192, 100], [192, 144]])
+    cameras = [
+        dataclasses.replace(rig.cameras[0], ignore=(left,)),
+        dataclasses.replace(rig.cameras[1], ignore=(bottom,)),
+    ]
+    hull = carve(masks, dataclasses.replace(rig, cameras=(*cameras, *rig.cameras[2:])), HullConfig(min_voxels=1))
+    assert isinstance(hull, Hull)
+    assert hull.views is not None
+    assert np.count_nonzero(hull.views.cells == kernels.UNASKED) > 500
+    assert (hull.views.sizes <= one_ball().sizes).all()
+    assert hull.views.mismatch(BALL, CENTRE, RADIUS) < 0.08
+    back = Views.unpacked(hull.views.packed)
+    assert back.cells.tobytes() == hull.views.cells.tobytes()
+
+
+def test_discs_between_two_rows_cover_nothing():
+    """Neither they nor the way between them meets the centre of a cell; one part lies across a row, one does not."""
+    frames, cells = np.array([[0, 0, 8, 8, 1, 0]]), np.zeros(64, np.uint8)
+    discs = np.array([[3.0, 4.0 - 2e-8, 1e-8], [3.0, 4.0 + 2e-8, 1e-8], [3.3, 4.3, 0.1]])
+    span, drawn = np.empty((8, 2)), np.zeros(64, np.int16)
+    parts = np.array([[0, 1, 1], [2, 2, 2]])
+    assert kernels.draw_parts(parts, discs, frames[0], span, cells, drawn, 1) == (0, 0)
+    assert not drawn.any()
+
+
+def test_arrays_of_any_layout_are_drawn_by_the_same_kernel():
+    views = one_ball()
+    expected = views.drawn(BALL, CENTRE, RADIUS)
+    compiled = len(kernels.draw.signatures)
+    spread = np.repeat(np.vstack([CENTRE, CENTRE]), 2, axis=0)[::2]
+    assert not spread.flags.c_contiguous
+    assert (views.drawn(BALL, spread, np.repeat(RADIUS, 4)[::2]) == expected).all()
+    assert len(kernels.draw.signatures) == compiled
+
+
+def test_a_hull_has_no_views_that_cannot_be_sent(monkeypatch):
+    """A live node would refuse them, and its angles would not be those of the offline run."""
+    rig = ring(4)
+    masks = ball_masks(rig, [((0.0, 0.1, 1.0), 0.4)])
+    monkeypatch.setattr(views_module, "MOST_CELLS", 1000)
+    hull = carve(masks, rig, HullConfig(min_voxels=1))
+    assert isinstance(hull, Hull)
+    assert hull.views is None
+
+
+def test_packed_and_unpacked_they_are_the_same():
+    whole = one_ball()
+    views = whole.without([Flesh(CENTRE + 0.2, 0.5 * RADIUS, BALL, ())])
+    assert set(views.cells) == {kernels.BARE, kernels.SEEN, kernels.UNASKED}
     again = Views.unpacked(views.packed)
     for name in ("cameras", "frames", "cells"):
         assert getattr(again, name).tobytes() == getattr(views, name).tobytes()
@@ -112,6 +177,9 @@ def test_what_no_views_pack_is_refused():
     frames, cameras = views.frames.copy(), views.cameras.copy()
     frames[0, 2] += 1
     cameras[0, 0] = np.nan
+    nobody = Views(cameras[:0], frames[:0], views.cells[:0])
+    tall = views.frames.copy()
+    tall[-1, 2:4] = 0, 3_000_000  # rows without cells
     for broken in (
         b"",
         data[:7],
@@ -121,6 +189,8 @@ def test_what_no_views_pack_is_refused():
         data[:4] + b"\xff" * 4 + data[8:],
         dataclasses.replace(views, frames=frames).packed,
         dataclasses.replace(views, cameras=cameras).packed,
+        dataclasses.replace(views, cells=views.cells[: views.frames[-1, 5]], frames=tall).packed,
+        nobody.packed,
     ):
         with pytest.raises(InputError):
             Views.unpacked(broken)

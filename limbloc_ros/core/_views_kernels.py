@@ -69,7 +69,7 @@ def _disc(x: float, y: float, r: float, height: int, span: Any) -> None:
 def _segment(x0: float, y0: float, x1: float, y1: float, height: int, span: Any) -> None:
     if y0 > y1:
         x0, y0, x1, y1 = x1, y1, x0, y0
-    slope = (x1 - x0) / (y1 - y0) if y1 > y0 else 0.0
+    slope = (x1 - x0) / (y1 - y0) if y1 - y0 > 1e-9 else 0.0  # of less it need not be a number
     for row in range(max(0, math.ceil(y0)), min(height - 1, math.floor(y1)) + 1):
         _widen(span, row, x0 + slope * (row - y0))
 
@@ -137,6 +137,8 @@ def draw_parts(parts: Any, discs: Any, frame: Any, span: Any, cells: Any, drawn:
         if a == b and b == d:
             _disc(discs[a, 0], discs[a, 1], discs[a, 2], height, span)
         for row in range(first, last + 1):
+            if not span[row, 0] <= span[row, 1]:
+                continue  # between two discs that are hardly points; infinity is no column
             begin = math.ceil(max(span[row, 0], 0.0))
             end = math.floor(min(span[row, 1], width - 1.0))
             for at in range(offset + row * width + begin, offset + row * width + end + 1):

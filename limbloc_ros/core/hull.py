@@ -248,9 +248,10 @@ def carve_silhouettes(silhouettes: Silhouettes, rig: Rig, config: HullConfig) ->
         hull = _with_labels(hull, labels, _people_among(hull, labels, sizes, silhouettes, config))
     if hull.inside_count * (config.voxel_m / 0.02) ** 3 < config.min_voxels:
         return NoPerson(f"the hull has only {hull.inside_count} voxels of {config.voxel_m} m: too small for a person")
-    # They travel with the hull's voxels, a word each (see `ros.cloud_messages`); only of tiny hulls there are too few.
-    room = 4 * int(np.count_nonzero(hull.sdf < np.float32(config.band_m)))
-    return replace(hull, views=views) if 4 + len(views.packed) <= room else hull
+    # They travel with the hull's voxels, a word each but for the first (see `ros.cloud_messages`); only of tiny hulls
+    # there are too few. What cannot travel is not used offline either: live angles are the same.
+    room = 4 * (int(np.count_nonzero(hull.sdf < np.float32(config.band_m))) - 1)
+    return replace(hull, views=views) if views.fits(room) else hull
 
 
 def largest_component(hull: Hull) -> Hull:

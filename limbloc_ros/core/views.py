@@ -29,6 +29,9 @@ Array = NDArray[np.float64]
 CELL_M = 0.012
 #: So far beyond the silhouette a figure that leaves it is still counted, m.
 MARGIN_M = 0.2
+#: A camera that sees less than this share of what the one that sees most sees, at the image's border or of somebody
+#: who is hidden, counts less than the others: of a few cells any figure misses many times as many.
+LEAST_SHARE = 0.1
 #: More than these are no views.
 MOST_CAMERAS, MOST_CELLS = 255, 4_000_000
 
@@ -50,7 +53,7 @@ class Views:
 
     @staticmethod
     def of(silhouettes: Silhouettes, points: Array) -> Views:
-        """The silhouettes' blobs that hold some of the hull.
+        """The silhouettes' blobs that hold some of the hull; of regions to ignore nobody is asked.
 
         Args:
             silhouettes: as they were carved with.
@@ -73,13 +76,22 @@ class Views:
         kernels.sample_cells(silhouettes.field, silhouettes.boxes, frames, cells)
         marks = np.zeros(count, np.uint8)
         kernels.mark_points(points, cameras, frames, marks)
-        for image, held in zip(_images(frames, cells), _images(frames, marks), strict=True):
-            if image.size:
-                _, blobs = cv2.connectedComponents(image, connectivity=8)
-                kept = np.zeros(int(blobs.max()) + 1, np.uint8)
-                kept[blobs[held > 0]] = 1
-                kept[0] = 0
-                image[:] = kept[blobs]
+        images = zip(frames, silhouettes.ignored, _images(frames, cells), _images(frames, marks), strict=True)
+        for (left, top, _, _, step, _), ignored, image, held in images:
+            if not image.size:
+                continue
+            unasked = np.zeros(image.shape, np.bool_)
+            if ignored is not None:  # foreground, for the hull's sake
+                rows, columns = (
+                    first + step // 2 + step * np.arange(n) for first, n in zip((top, left), image.shape, strict=True)
+                )
+                unasked = ignored[np.ix_(rows, columns)] > 0
+                image[unasked] = kernels.BARE
+            _, blobs = cv2.connectedComponents(image, connectivity=8)
+            kept = np.zeros(int(blobs.max()) + 1, np.uint8)
+            kept[blobs[held > 0]] = kernels.SEEN
+            kept[0] = kernels.BARE
+            image[:] = np.where(unasked, np.uint8(kernels.UNASKED), kept[blobs])
         return Views(cameras, frames, cells)._cropped()
 
     def _cropped(self) -> Views:
@@ -87,7 +99,7 @@ class Views:
         frames, images = self.frames.copy(), []
         count = 0
         for frame, image in zip(frames, _images(self.frames, self.cells), strict=True):
-            x, y, width, height = cv2.boundingRect(image) if image.size else (0, 0, 0, 0)
+            x, y, width, height = cv2.boundingRect(np.uint8(image == kernels.SEEN)) if image.size else (0, 0, 0, 0)
             margin = round(MARGIN_M / CELL_M)
             left, top = max(0, x - margin), max(0, y - margin)
             part = image[top : y + height + margin, left : x + width + margin] if width else image[:0, :0]
@@ -108,10 +120,16 @@ class Views:
 
     @cached_property
     def packed(self) -> bytes:
-        """All of it in few bytes; `unpacked` makes the very same of them. Not of what is `without` somebody."""
+        """All of it in few bytes; `unpacked` makes the very same of them."""
         shape = np.array([len(self.cameras), len(self.cells)], "<u4")
         numbers = self.cameras.astype("<f8").tobytes() + self.frames.astype("<i8").tobytes()
-        return shape.tobytes() + zlib.compress(numbers + np.packbits(self.cells == kernels.SEEN).tobytes(), 1)
+        bits = [np.packbits(self.cells == kind).tobytes() for kind in (kernels.SEEN, kernels.UNASKED)]
+        return shape.tobytes() + zlib.compress(numbers + b"".join(bits), 1)
+
+    def fits(self, room: int) -> bool:
+        """Whether these views can be sent in so many bytes."""
+        few = len(self.cameras) <= MOST_CAMERAS and len(self.cells) <= MOST_CELLS
+        return few and len(self.packed) <= room
 
     @staticmethod
     def unpacked(data: bytes) -> Views:
@@ -124,10 +142,10 @@ class Views:
             raise InputError(f"packed views have 8 bytes or more, got {len(data)}")
         count, size = (int(n) for n in np.frombuffer(data[:8], "<u4"))
         columns = projection.CAMERA_COLUMNS
-        expected = count * 8 * (columns + 6) + (size + 7) // 8
-        if count > MOST_CAMERAS or size > MOST_CELLS:
+        expected = count * 8 * (columns + 6) + 2 * ((size + 7) // 8)
+        if not 0 < count <= MOST_CAMERAS or size > MOST_CELLS:
             raise InputError(
-                f"expected views of at most {MOST_CAMERAS} cameras and {MOST_CELLS} cells, got {count} and {size}"
+                f"expected views of 1 to {MOST_CAMERAS} cameras and at most {MOST_CELLS} cells, got {count} and {size}"
             )
         reader = zlib.decompressobj()
         try:
@@ -139,9 +157,10 @@ class Views:
         cut = count * 8 * columns
         cameras = np.frombuffer(found[:cut], "<f8").reshape(count, columns).copy()
         frames = np.frombuffer(found[cut : cut + count * 48], "<i8").reshape(count, 6).copy()
-        cells = np.unpackbits(np.frombuffer(found[cut + count * 48 :], np.uint8), count=size)
+        bits = np.frombuffer(found[cut + count * 48 :], np.uint8).reshape(2, -1)
+        seen, unasked = np.unpackbits(bits, axis=1, count=size)
         _check(cameras, frames, size)
-        return Views(cameras, frames, cells)
+        return Views(cameras, frames, np.where(unasked, np.uint8(kernels.UNASKED), seen))
 
     def drawn(self, parts: NDArray[np.int64], centres: Array, radii: Array) -> NDArray[np.int16]:
         """Which cells a figure of parts [P, 3] over balls (centres [S, 3], radii [S], m) covers."""
@@ -151,11 +170,14 @@ class Views:
         self, parts: NDArray[np.int64], centres: Array, radii: Array
     ) -> tuple[NDArray[np.int16], NDArray[np.int64]]:
         out = np.zeros(len(self.cells), np.int16)
-        counts = kernels.draw(parts, centres, radii, self.cameras, self.frames, self.cells, out)
+        # Parts of other arrays, too: kernels are compiled for one layout, not again in the first frame with others.
+        figure = np.ascontiguousarray(parts), np.ascontiguousarray(centres), np.ascontiguousarray(radii)
+        counts = kernels.draw(*figure, self.cameras, self.frames, self.cells, out)
         return out, counts
 
     def mismatch(self, parts: NDArray[np.int64], centres: Array, radii: Array) -> float:
-        """Area that the figure and the silhouettes do not share over that of the silhouettes; mean of the cameras."""
+        """Area that the figure and the silhouettes do not share over that of the silhouettes; mean of the cameras that
+        see anybody, in which one that sees far less than others (LEAST_SHARE) has less of a say."""
         _, counts = self._draw(parts, centres, radii)
         return float(self.worth @ (self.sizes - counts[:, 0] + counts[:, 1]))
 
@@ -168,7 +190,8 @@ class Views:
     def worth(self) -> Array:
         """[C] what one cell of each camera counts in the mismatch."""
         seen = self.sizes > 0
-        return np.asarray(np.where(seen, 1.0 / np.maximum(self.sizes, 1), 0.0) / max(np.count_nonzero(seen), 1))
+        least = max(1.0, LEAST_SHARE * float(self.sizes.max()))
+        return np.asarray(np.where(seen, 1.0 / np.maximum(self.sizes, least), 0.0) / max(np.count_nonzero(seen), 1))
 
     def open_cells(self, body: NDArray[np.int16], most: int) -> tuple[NDArray[np.int64], Array]:
         """Some cells of the silhouettes that a body, as it was `drawn`, leaves open, and what each stands for."""
@@ -207,6 +230,7 @@ def _check(cameras: Array, frames: NDArray[np.int64], size: int) -> None:
     _, _, width, height, step, offset = frames.T
     fair = (np.abs(frames) < MOST_CELLS).all() and (frames[:, :4] >= 0).all() and (step > 0).all()
     cells = width * height
+    fair = fair and ((width == 0) == (height == 0)).all()  # no rows to go through that have no cells
     if not fair or (offset != np.cumsum(cells) - cells).any() or int(cells.sum()) != size:
         raise InputError("the frames of packed views do not fit their cells")
     if not (np.abs(cameras) < 1e9).all() or (cameras[:, 12:14] <= 0).any() or (cameras[:, 31:33] < 2).any():
