@@ -27,6 +27,8 @@ Rivals = Sequence[tuple[FigureState, float]]
 CUT_M2 = 0.02
 #: A figure of this XOR energy is none of that hull.
 NO_MATCH_XOR = 0.62
+#: Where nobody knows what the cameras saw, one of this smooth energy (m^2) is none either.
+NO_MATCH_COST = 2.8e-4
 #: The chance that some joint of the limbs is 15 cm off from which on a pose is not to be acted on. Its log-odds are
 #: those of a figure without any sign of that, and what is added for each sign (`risk_of`):
 #: - the less an arm shows: the logarithms of what only the upper arm and only the forearm explain of the silhouettes
@@ -133,6 +135,8 @@ def describe_pose(
     shown = None if surface is None else limbs_shown(hull, surface, flesh)
     passed_m = 0.0 if surface is None else unexplained_m(hull, surface, flesh, others)
     risk, sign = risk_of(hull, flesh, energy, shown, passed_m)
+    if risk == 0.0 and system is not None and system.cost >= NO_MATCH_COST:
+        risk, sign = 1.0, "the figure does not match the hull's surface, and where the cameras are is not known"
     return Pose(
         joints=placed.joints,
         rotations=placed.rotations,
