@@ -1,11 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the cameras give back to each other's masks: limbs that one of them lost, but no phantoms."""
 
+import dataclasses
+
 import cv2
 import numpy as np
 import pytest
+from camera_rings import LENSES, ball_masks, measured, one_to_one, ring
 
 from limbloc_ros.core import hull, mending
+from limbloc_ros.core._mending_kernels import BLOCK
 from limbloc_ros.core.config import HullConfig
 from limbloc_ros.core.silhouettes import measure_silhouettes, pack_cameras
 from limbloc_ros.recordings.cases import Case, load_case
@@ -84,3 +88,31 @@ def test_clean_masks_of_eight_cameras_gain_nothing_from_outvoting_two(eight: Cas
     voxels = hull.evaluate(silhouettes, CONFIG.band_m)
     covered = mending.cover_silhouettes(silhouettes, voxels, CONFIG)
     assert mending.mend_twice_denied(silhouettes, covered, voxels, CONFIG) is silhouettes
+
+
+@pytest.mark.parametrize("lens", [LENSES[0], LENSES[3]], ids=lambda lens: lens[0])
+def test_no_voxel_that_two_masks_miss_is_overlooked(lens: tuple[str, list[float]]) -> None:
+    """Halving blocks leaves every voxel that two cameras deny at most, of all in the room, looked at one by one."""
+    config = dataclasses.replace(CONFIG, voxel_m=0.04, band_m=0.08)
+    rig = ring(7, focal=90.0, lens=lens)
+    masks = ball_masks(rig, [((0.0, 0.1, 1.0), 0.4), ((0.5, -0.6, 0.7), 0.2)])
+    silhouettes = measured(rig, masks, config)
+    low, high = silhouettes.lattice
+    blocks = mending._rarely_denied(low, high, silhouettes)
+    kept = np.zeros(high - low, bool)
+    for i, j, k in blocks - low:
+        kept[i : i + BLOCK, j : j + BLOCK, k : k + BLOCK] = True
+    local = np.random.default_rng(0).integers(0, high - low, (2000, 3))
+    points = (local + low + 0.5) * config.voxel_m
+    denied, seen = np.zeros(len(points), int), np.zeros(len(points), int)
+    for c, camera in enumerate(rig.cameras):
+        uv, depth = camera.world_to_image(points)
+        visible = (depth > 0) & (uv >= 0).all(axis=1) & (uv <= (camera.width - 1, camera.height - 1)).all(axis=1)
+        visible &= one_to_one(camera, points) == 1.0
+        x, y = np.where(visible[:, None], np.floor(uv + 0.5), 0).astype(int).T
+        seen += visible
+        denied += visible & (silhouettes.whole_mask(c)[y, x] == 0)
+    wanted = local[(denied <= 2) & (seen >= 4)]
+    assert len(wanted) > 30
+    assert kept[tuple(wanted.T)].all()
+    assert kept.mean() < 0.5

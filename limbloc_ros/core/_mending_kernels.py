@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from limbloc_ros.core._projection_kernels import project, project_block, row_start
+from limbloc_ros.core._block_kernels import NEARER_PX, block_balls, counts_any
+from limbloc_ros.core._projection_kernels import UNSEEN, WITHIN, project, project_block, row_start, view_of_balls
 
-#: Edge of a block of voxels that is looked at as a whole; distances are not known for larger ones.
+#: Edge of the smallest blocks of voxels that are looked at as a whole.
 BLOCK = 2
 
 
@@ -108,72 +109,67 @@ def count_unexplained(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
-def surely_denied(x: float, y: float, z: float, radius: float, cams: Any, boxes: Any, field: Any, margins: Any) -> int:
-    """How many cameras, up to three, deny all of a ball, m: its centre is further outside than the ball reaches."""
-    denied = 0
+def rarely_denied(
+    blocks: Any, size: int, voxel: float, cams: Any, frames: Any, sums: Any, most: int, least_seen: int
+) -> Any:
+    """Which blocks (cubes of `size` voxels) may hold a voxel that `most` cameras at most deny and enough see; bool [B].
+
+    `frames` and `sums` count the foreground (see `silhouettes.PixelCounts`).
+    """
+    centres, radius = block_balls(blocks, size, voxel)
+    views = np.empty((5, len(blocks)))
+    denied = np.zeros(len(blocks), np.int64)
+    unseen = np.zeros(len(blocks), np.int64)
     for c in range(len(cams)):
-        u, v, depth = project(cams, c, row_start(cams, c, x, y), z)
-        if depth <= 2.0 * radius or u < 0.0 or v < 0.0 or u > cams[c, 31] - 1.0 or v > cams[c, 32] - 1.0:
-            continue
-        a = math.floor(u + 0.5) - boxes[c, 0]
-        b = math.floor(v + 0.5) - boxes[c, 1]
-        beyond = a < 0 or b < 0 or a >= boxes[c, 2] or b >= boxes[c, 3]
-        away = margins[c] if beyond else field[boxes[c, 4] + b * boxes[c, 2] + a]
-        # nearer parts of the ball are seen larger; a pixel for the rounding, a tenth for the lens
-        if away - 1.0 > 1.1 * radius * cams[c, 12] / (depth - radius):
-            denied += 1
-        if denied > 2:
-            break
-    return denied
+        view_of_balls(cams, c, centres, radius, len(blocks), views)
+        for n in range(len(blocks)):
+            if views[4, n] == UNSEEN:
+                unseen[n] += 1
+            elif views[4, n] == WITHIN and denied[n] <= most:
+                denied[n] += not counts_any(frames, sums, c, views[0, n], views[1, n], views[3, n] + NEARER_PX)
+    return (denied <= most) & (len(cams) - unseen >= least_seen)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def doubly_denied(
-    low: Any, high: Any, voxel: float, cams: Any, boxes: Any, field: Any, margins: Any, covered: Any, inner_px: float,
+    blocks: Any, high: Any, voxel: float, cams: Any, boxes: Any, field: Any, covered: Any, inner_px: float,
     least_seen: int, least_unexplained: int,
 ) -> Any:  # fmt: skip
     """Voxels that exactly two cameras deny and of which others see the contrary, on foreground that nothing covers.
 
-    Looks at a box of the lattice (`high` exclusive), block by block: most blocks three cameras deny at once.
+    Looks at blocks [B, 3] of BLOCK voxels (their lowest lattice indices), as far as they lie below `high`.
 
     Returns centres float64 [V, 3] m, the two cameras int16 [V, 2], and depth float64 [V] m in all other silhouettes.
     """
     found = [(0.0, 0.0, 0.0, 0, 0, 0.0) for _ in range(0)]  # an empty list whose type numba knows
-    radius = 0.5 * BLOCK * voxel * math.sqrt(3.0)
     first, second = 0, 0
-    for bi in range(low[0], high[0], BLOCK):
-        for bj in range(low[1], high[1], BLOCK):
-            for bk in range(low[2], high[2], BLOCK):
-                half = 0.5 * BLOCK
-                middle = ((bi + half) * voxel, (bj + half) * voxel, (bk + half) * voxel)
-                if surely_denied(middle[0], middle[1], middle[2], radius, cams, boxes, field, margins) > 2:
+    for n in range(len(blocks)):
+        for m in range(BLOCK * BLOCK * BLOCK):
+            i, j, k = blocks[n, 0] + m // (BLOCK * BLOCK), blocks[n, 1] + m // BLOCK % BLOCK, blocks[n, 2] + m % BLOCK
+            if i >= high[0] or j >= high[1] or k >= high[2]:
+                continue
+            x, y, z = (i + 0.5) * voxel, (j + 0.5) * voxel, (k + 0.5) * voxel
+            denied, seen, unexplained, shallow = 0, 0, 0, math.inf
+            for c in range(len(cams)):
+                u, v, depth = project(cams, c, row_start(cams, c, x, y), z)
+                if depth <= 0.0 or u < 0.0 or v < 0.0 or u > cams[c, 31] - 1.0 or v > cams[c, 32] - 1.0:
                     continue
-                for m in range(BLOCK * BLOCK * BLOCK):
-                    i, j, k = bi + m // (BLOCK * BLOCK), bj + m // BLOCK % BLOCK, bk + m % BLOCK
-                    if i >= high[0] or j >= high[1] or k >= high[2]:
-                        continue
-                    x, y, z = (i + 0.5) * voxel, (j + 0.5) * voxel, (k + 0.5) * voxel
-                    denied, seen, unexplained, shallow = 0, 0, 0, math.inf
-                    for c in range(len(cams)):
-                        u, v, depth = project(cams, c, row_start(cams, c, x, y), z)
-                        if depth <= 0.0 or u < 0.0 or v < 0.0 or u > cams[c, 31] - 1.0 or v > cams[c, 32] - 1.0:
-                            continue
-                        seen += 1
-                        a = math.floor(u + 0.5) - boxes[c, 0]
-                        b = math.floor(v + 0.5) - boxes[c, 1]
-                        beyond = a < 0 or b < 0 or a >= boxes[c, 2] or b >= boxes[c, 3]
-                        at = 0 if beyond else boxes[c, 4] + b * boxes[c, 2] + a
-                        if beyond or field[at] >= 0.0:
-                            first, second = (c, second) if denied == 0 else (first, c)
-                            denied += 1
-                            if denied > 2:
-                                break
-                            continue
-                        if field[at] < -inner_px and covered[at] == 0:
-                            unexplained += 1
-                        shallow = min(shallow, -field[at] * depth / cams[c, 12])
-                    if denied == 2 and seen >= least_seen and unexplained >= least_unexplained:
-                        found.append((x, y, z, first, second, shallow))
+                seen += 1
+                a = math.floor(u + 0.5) - boxes[c, 0]
+                b = math.floor(v + 0.5) - boxes[c, 1]
+                beyond = a < 0 or b < 0 or a >= boxes[c, 2] or b >= boxes[c, 3]
+                at = 0 if beyond else boxes[c, 4] + b * boxes[c, 2] + a
+                if beyond or field[at] >= 0.0:
+                    first, second = (c, second) if denied == 0 else (first, c)
+                    denied += 1
+                    if denied > 2:
+                        break
+                    continue
+                if field[at] < -inner_px and covered[at] == 0:
+                    unexplained += 1
+                shallow = min(shallow, -field[at] * depth / cams[c, 12])
+            if denied == 2 and seen >= least_seen and unexplained >= least_unexplained:
+                found.append((x, y, z, first, second, shallow))
     points = np.empty((len(found), 3))
     deniers = np.empty((len(found), 2), np.int16)
     depths = np.empty(len(found))

@@ -8,6 +8,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from limbloc_ros.core import _block_kernels as near
 from limbloc_ros.core import _mending_kernels as kernels
 from limbloc_ros.core.config import HullConfig
 from limbloc_ros.core.silhouettes import Silhouettes, min_seen
@@ -21,6 +22,8 @@ INNER_PX = 1.5
 LOST_M = 0.3
 #: So many cameras are needed that two of them may be outvoted, by so many others that see something unexplained there.
 ENOUGH_CAMERAS, WITNESSES = 6, 2
+#: Edge of the largest blocks that are looked at as a whole, in voxels; halved until they have BLOCK.
+COARSEST = 16
 
 
 def cover_silhouettes(silhouettes: Silhouettes, voxels: Voxels, config: HullConfig) -> NDArray[np.uint8]:
@@ -100,11 +103,27 @@ def mend_twice_denied(
     low = np.maximum(inside.min(axis=0) - around, silhouettes.lattice[0])
     high = np.minimum(inside.max(axis=0) + around + 1, silhouettes.lattice[1])
     points, deniers, depths = kernels.doubly_denied(
-        low, high, config.voxel_m, silhouettes.cameras, silhouettes.boxes, silhouettes.field, silhouettes.margins,
-        covered, INNER_PX, min_seen(len(silhouettes.names)), WITNESSES,
+        _rarely_denied(low, high, silhouettes), high, config.voxel_m, silhouettes.cameras, silhouettes.boxes,
+        silhouettes.field, covered, INNER_PX, min_seen(len(silhouettes.names)), WITNESSES,
     )  # fmt: skip
     radii = np.maximum(depths, 0.9 * config.voxel_m)
     return _painted(silhouettes, np.repeat(points, 2, axis=0), np.repeat(radii, 2), deniers.ravel())
+
+
+def _rarely_denied(low: NDArray[np.int64], high: NDArray[np.int64], silhouettes: Silhouettes) -> NDArray[np.int32]:
+    """The blocks [B, 3] in a box of the lattice (`high` exclusive) that may hold voxels that no more than two cameras
+    deny: blocks of BLOCK voxels, found by halving, for three cameras deny most of a room at once."""
+    size = COARSEST
+    axes = [np.arange(low[a], high[a], size, dtype=np.int32) for a in range(3)]
+    blocks: NDArray[np.int32] = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    counts = silhouettes.counts
+    table = (silhouettes.voxel_m, silhouettes.cameras, counts.frames, counts.sums)
+    while True:
+        blocks = blocks[kernels.rarely_denied(blocks, size, *table, 2, min_seen(len(silhouettes.names)))]
+        if size == kernels.BLOCK:
+            return blocks
+        blocks = near.split_blocks(blocks, size, high)
+        size //= 2
 
 
 def _painted(
