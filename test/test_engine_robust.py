@@ -4,11 +4,13 @@
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from limbloc_ros.core import engine_robust, figure
+from limbloc_ros.core._figure_kernels import exp_so3
 from limbloc_ros.core.camera import Camera, Rig
 from limbloc_ros.core.config import HullConfig
 from limbloc_ros.core.energy import Weights, system
@@ -102,6 +104,23 @@ def test_rivals_explain_the_hull_nearly_as_well(name, frame):
     best = fit.rivals[int(np.argmin(shares))][0]
     shift = figure.place(best).joints - figure.place(fit.state).joints
     assert np.median(np.linalg.norm(shift, axis=1)) < 0.05
+
+
+def test_of_figures_of_one_energy_the_one_that_the_cameras_saw_wins():
+    """An arm elsewhere, which the hull may allow where a mask lost the right one, is not where the silhouettes are."""
+    hull, right = hull_of(*PEOPLE[0]), fit_of(*PEOPLE[0]).state
+    rotations = right.rotations.copy()
+    bone = figure.BONE["upper_arm_L"]
+    rotations[bone] = rotations[bone] @ exp_so3(np.array([0.0, 1.2, 0.0]))
+    wrong = figure.FigureState(right.root, rotations, right.shape)
+    of_cost = [SimpleNamespace(state=state, system=SimpleNamespace(cost=2e-4)) for state in (wrong, right)]
+    assert engine_robust._best(of_cost, 1, hull)[0].state is right
+    assert engine_robust._best(of_cost[::-1], 1, hull)[0].state is right
+    # by more than energies of right and wrong figures differ, which a hull alone does not tell
+    assert engine_robust.unseen(wrong, hull) > engine_robust.unseen(right, hull) + 2e-4
+    assert engine_robust._best(of_cost, 1, replace(hull, views=None))[0].state is wrong
+    costly = SimpleNamespace(state=right, system=SimpleNamespace(cost=1.0))
+    assert engine_robust._best([costly, of_cost[0]], 2, hull) == [of_cost[0], costly]  # energy counts as well
 
 
 def test_another_seed_finds_the_same_person():

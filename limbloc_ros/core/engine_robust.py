@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The robust engine: hypotheses by exhaustive search, refined by least squares, judged by the energy."""
+"""The robust engine: hypotheses by exhaustive search, refined by least squares, judged by energy and silhouettes."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Effort:
         strict: so many are refined under strict joint limits.
         single_arms, single_legs, rounds: other places that are tried for each limb of the winner, and how many rounds
             of that at most.
-        finalists: so many are refined on all points; the one of lowest energy is the result.
+        finalists: so many are refined on all points; the one of lowest energy and mismatch is the result.
         candidates: places that are weighed for each limb.
         quick_points, points: surface points until then, and then.
         iterations: most steps of the refinements: first, survivors, repairs, under strict limits, final.
@@ -366,7 +366,7 @@ def _fit_from_torsos(torsos: list[FigureState], scene: Scene, effort: Effort) ->
 def _with_better_limb(
     winner: Refined, scene: Scene, kind: search.LimbKind, side: str, places: int, effort: Effort
 ) -> Refined:
-    """The winner, or it with one limb elsewhere if that explains the hull better: trunk and sizes are known by now."""
+    """The winner, or it with one limb elsewhere if that fits better: trunk and sizes are known by now."""
     _, _, repair, limited, final = effort.iterations
     for state in with_one_limb(winner.state, scene, kind, side, places, effort.candidates):
         settled = refine(state, scene.quick, scene.lenient, repair).state
