@@ -42,6 +42,8 @@ class Effort:
         single_arms, single_legs, rounds: other places that are tried for each limb of the winner, and how many rounds
             of that at most.
         finalists: so many are refined on all points; the one of lowest energy and mismatch is the result.
+        last_arms, last_legs, last_rounds: so many other pairs are tried for the best figure of all searches so far, and
+            how many rounds of that at most.
         candidates: places that are weighed for each limb.
         quick_points, points: surface points until then, and then.
         iterations: most steps of the refinements: first, survivors, repairs, under strict limits, final.
@@ -65,6 +67,9 @@ class Effort:
     single_legs: int = 2
     rounds: int = 2
     finalists: int = 2
+    last_arms: int = 5
+    last_legs: int = 2
+    last_rounds: int = 0
     candidates: int = 80
     quick_points: int = 350
     points: int = 1000
@@ -92,7 +97,7 @@ QUICK = Effort(
 )  # fmt: skip
 HARDER = Effort(
     torsos=14, torso_search=search.TorsoSearch(headings=12, listed=3000, compared=200, climbed=60, steps=480),
-    leg_pairs=4, starts=24, survivors=8, repaired=3, finalists=5, enough=0.0, dressed=True,
+    leg_pairs=4, starts=24, survivors=8, repaired=3, finalists=5, last_rounds=2, enough=0.0, dressed=True,
 )  # fmt: skip
 SEARCHES = (QUICK, Effort(), HARDER)
 #: Torsos of one hull that differ and are worth a try.
@@ -303,9 +308,29 @@ def fit_from_scratch(
         fit = Fit(found.state, found.system, rivals, judged, unseen(found.state, hull))
         if best is None or fit.verdict < best.verdict:
             best = fit
-        if best.judged < effort.enough:
+        if best.judged < effort.enough:  # of the energy alone: what silhouettes cost depends on how ragged they are
             break
+        for _ in range(effort.last_rounds):
+            better = _with_other_limbs(best, scene, effort)
+            if better is best:
+                break
+            best = better
     return best
+
+
+def _with_other_limbs(best: Fit, scene: Scene, effort: Effort) -> Fit:
+    """The best figure of all searches, or it with another pair of arms or legs: each search has seen other trunks."""
+    _, _, repair, _, final = effort.iterations
+    others = with_arms(best.state, scene, effort.last_arms, effort.candidates)
+    others += with_legs(best.state, scene, effort.last_legs, effort.candidates)
+    found = best
+    for state in others:
+        settled = refine(state, scene.quick, scene.lenient, repair)
+        other = refine(settled.state, scene.full, scene.weights, final)
+        fit = Fit(other.state, other.system, best.rivals, _judged(other, scene), unseen(other.state, scene.hull))
+        if fit.verdict < found.verdict:
+            found = fit
+    return found
 
 
 def _torsos(hull: Hull, medial: Medial, seed: int, effort: search.TorsoSearch) -> list[FigureState]:

@@ -33,7 +33,7 @@ MARGIN_M = 0.2
 #: who is hidden, counts less than the others: of a few cells any figure misses many times as many.
 LEAST_SHARE = 0.1
 #: More than these are no views.
-MOST_CAMERAS, MOST_CELLS = 255, 4_000_000
+MOST_CAMERAS, MOST_CELLS = 255, 1_000_000
 
 
 @dataclass(frozen=True)
