@@ -23,7 +23,7 @@ from limbloc_ros.core.engine_robust import (
     unseen,
     with_one_limb,
 )
-from limbloc_ros.core.figure import BONE, FigureState
+from limbloc_ros.core.figure import BONE, FigureState, place
 from limbloc_ros.core.hull import Hull
 from limbloc_ros.core.search import ARM, LEG, Medial
 from limbloc_ros.core.surface import Surface
@@ -52,12 +52,15 @@ class Tracker:
         QUICK,
         Effort(
             leg_pairs=2, starts=6, survivors=3, arm_repairs=2, strict=2, finalists=1, single_arms=2, single_legs=0,
-            rounds=1,
+            rounds=1, shown=False,
         ),
     )  # fmt: skip
     #: Limbs are checked at once when the cost is so much above the usual one (in vain, the wait doubles); other places
-    #: that are tried for each; how much lower the energy must be there.
-    LIMB_DOUBT, ARM_PLACES, LEG_PLACES, BETTER = 1.25, 1, 1, 0.97
+    #: that are tried for each; by how much of the energy this, and what
+    #: the silhouettes add to it, must be lower there.
+    LIMB_DOUBT, ARM_PLACES, LEG_PLACES, LIMB_GAIN = 1.25, 1, 1, 0.03
+    #: A limb that all its joints have so near to where it is stays there.
+    SAME_PLACE_M = 0.05
     #: The figure is carried along with the firm weights of the search, which lead from further off; so many more steps
     #: with the final ones put its joints in their places.
     FINAL_STEPS = 6
@@ -166,10 +169,13 @@ class Tracker:
         for kind, places in ((ARM, self.ARM_PLACES), (LEG, self.LEG_PLACES)):
             for side in "LR":
                 for state in with_one_limb(result.state, scene, kind, side, places, QUICK.candidates):
+                    away = place(state).joints - place(result.state).joints
+                    if np.linalg.norm(away, axis=1).max() < self.SAME_PLACE_M:
+                        continue
                     settled = refine(state, scene.quick, scene.lenient, 5, size).state
                     other = refine(settled, evidence, self._firm, 8, size)
                     gain = result.system.cost - other.system.cost
                     gain += unseen(result.state, hull) - unseen(other.state, hull)
-                    if gain > (1.0 - self.BETTER) * result.system.cost:
+                    if gain > self.LIMB_GAIN * result.system.cost:
                         result = other
         return result
