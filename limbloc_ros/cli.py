@@ -37,7 +37,7 @@ first steps:
 Exit codes: 0 done, 1 something failed on the way, 2 wrong input (one line says what was expected), 130 interrupted.
 """
 
-EXIT_INPUT, EXIT_INTERRUPTED = 2, 130
+EXIT_INPUT, EXIT_INTERRUPTED = 2, interrupts.EXIT_CODE
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -13,7 +13,7 @@ from limbloc_ros.core import interrupts
 
 # Every look-up of a cached kernel is met by a signal; llvmlite looks them up in a callback that LLVM calls.
 LOADING = """
-import signal
+import signal, time
 from llvmlite.binding.executionengine import ExecutionEngine
 from limbloc_ros.core import interrupts
 from limbloc_ros.core.background import warm_up
@@ -30,7 +30,8 @@ ExecutionEngine._find_module_ptr = interrupted_look_up
 interrupts.install((signal.{name},))
 try:
     warm_up()
-    print("loaded, never interrupted")
+    time.sleep(30.0)  # at the latest here
+    print("never interrupted")
 except KeyboardInterrupt:
     print("interrupted", len(met))
 """
@@ -52,5 +53,23 @@ def test_elsewhere_a_signal_interrupts_at_once():
         interrupts.install((signal.SIGUSR1,))
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(signal.SIGUSR1)
+    finally:
+        signal.signal(signal.SIGUSR1, before)
+
+
+@pytest.mark.parametrize("module", ["llvmlite.binding.any", "numba.core.any"])
+def test_whatever_a_compiler_calls_back_comes_to_its_end(module):
+    back = "def called_back():\n    signal.raise_signal(signal.SIGUSR1)\n    ended.append(True)\n"
+    ended = []
+    names = {"__name__": module, "signal": signal, "ended": ended}
+    exec(compile(back, module, "exec"), names)
+    before = signal.getsignal(signal.SIGUSR1)
+    try:
+        interrupts.install((signal.SIGUSR1,))
+        with pytest.raises(KeyboardInterrupt):
+            names["called_back"]()
+            while True:
+                signal.pause()
+        assert ended == [True]
     finally:
         signal.signal(signal.SIGUSR1, before)

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
+from limbloc_ros.core import interrupts
 from limbloc_ros.core.config import from_mapping
 from limbloc_ros.core.errors import ConfigError, InputError
 from limbloc_ros.recordings import offline
@@ -129,7 +130,8 @@ def run(args: argparse.Namespace) -> int:
     if "background" in source.about:
         say(f"background of the room: {source.about['background']}")
     started = time.monotonic()
-    offline.prepare(say)
+    with interrupts.ending_at_once("limbloc process: interrupted before the first frame"):
+        offline.prepare(say)
     total = None if source.frames is None else source.frames - args.leave_out
     with tqdm(total=total, unit="frame", disable=None, dynamic_ncols=True) as bar:
 
