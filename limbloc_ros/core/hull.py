@@ -225,7 +225,7 @@ def carve_silhouettes(silhouettes: Silhouettes, rig: Rig, config: HullConfig) ->
     # Ragged masks bite a little from every side. The more the cameras contradict each other, the less may a single
     # one decide; with few cameras two vetoes would leave far too much.
     doubt = 0.0
-    if len(silhouettes.names) >= 6:
+    if len(silhouettes.names) >= mending.ENOUGH_CAMERAS:
         doubt = min(1.0, contradiction / DOUBTED_FRACTION) * config.shared_veto
     indices, distance, who = kernels.blend_voxels(voxels, np.float32(doubt), np.float32(config.band_m))
     if not (distance < 0).any():

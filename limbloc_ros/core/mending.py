@@ -20,7 +20,8 @@ Voxels = tuple[NDArray[np.int32], NDArray[np.float32], NDArray[np.float32], NDAr
 INNER_PX = 1.5
 #: So far around the hull is looked for what two masks miss, m: a forearm and a hand.
 LOST_M = 0.3
-#: So many cameras are needed that two of them may be outvoted, by so many others that see something unexplained there.
+#: From so many cameras on depth says that a mask has a hole, and two cameras may be outvoted, by so many others that
+#: see something unexplained there.
 ENOUGH_CAMERAS, WITNESSES = 6, 2
 #: Edge of the largest blocks that are looked at as a whole, in voxels; halved until they have BLOCK.
 COARSEST = 16
@@ -76,7 +77,7 @@ def mend_silhouettes(
     unexplained = kernels.count_unexplained(points, deniers, *table, silhouettes.field, covered, INNER_PX)
     # Few cameras leave a hull so fat that depth says little: four of them gain 12 % phantom volume from clean masks,
     # a third from ragged ones.
-    deep = depths > (config.repair_depth_m if len(silhouettes.names) >= 6 else np.inf)
+    deep = depths > (config.repair_depth_m if len(silhouettes.names) >= ENOUGH_CAMERAS else np.inf)
     give_back = (unexplained >= 2) | deep
     return _painted(silhouettes, points[give_back], np.maximum(depths[give_back], half), deniers[give_back])
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,8 +57,8 @@ class Tracker:
         ),
     )  # fmt: skip
     #: Limbs are checked at once when the cost is so much above the usual one (in vain, the wait doubles); other places
-    #: that are tried for each; by how much of the energy this, and what
-    #: the silhouettes add to it, must be lower there.
+    #: that are tried for each; by how much of the energy it and what the
+    #: silhouettes add must be lower there.
     LIMB_DOUBT, ARM_PLACES, LEG_PLACES, LIMB_GAIN = 1.25, 1, 1, 0.03
     #: A limb that all its joints have so near to where it is stays there.
     SAME_PLACE_M = 0.05
@@ -115,9 +116,11 @@ class Tracker:
             judged = energy.system(result.state, evidence, self._firm).cost
             final = refine(result.state, evidence, self._weights, self.FINAL_STEPS, size)
             self._remember(final.state.shape)
-            fit = Fit(final.state, final.system, judged=judged, unseen=unseen(final.state, hull))
+            fit = Fit(final.state, final.system, judged=judged)
         if fit is None or self._doubts(fit.judged):
             self._last_scratch = self._frame
+            if fit is not None:
+                fit = replace(fit, unseen=unseen(fit.state, hull))
             # while there is a figure, a quick search first: what it misses is searched harder the next time
             searches = self._searches if fit is None or self._vain else self._searches[:1]
             scratch = fit_from_scratch(hull, surface, self._seed, self._weights, searches)
