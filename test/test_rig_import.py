@@ -60,6 +60,17 @@ def test_two_tools_measured_the_same_cameras():
     assert any("metres are plausible" in line for line in said)
 
 
+def test_the_benchmarks_direction_is_told_as_it_stands_in_the_file(tmp_path):
+    """calib.json has x_cam = R X + t, and whoever overrules that must find the file's own numbers turned round."""
+    rig = default_rig(4)
+    FORMATS["benchmark"].write(rig, tmp_path / "calib.json")
+    reading = FORMATS["benchmark"].read([tmp_path / "calib.json"])
+    assert reading.direction == WORLD_TO_CAMERA
+    np.testing.assert_allclose(reading.cameras[0].T, rig.cameras[0].T_camera_world, atol=1e-12)
+    _, said = settle(reading, Wishes())
+    assert any(line.startswith("direction: world-to-camera, as the format documents") for line in said)
+
+
 def test_aniposelib_asks_for_unit_and_up():
     with pytest.raises(RigError, match=r"unit of length is not written.*--unit mm: the cameras stand 0\.42 m to 0\.53"):
         imported("aniposelib_calibration.toml")

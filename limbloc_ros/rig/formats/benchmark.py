@@ -10,7 +10,7 @@ from pathlib import Path
 from limbloc_ros.core.camera import Rig
 from limbloc_ros.core.errors import RigError
 from limbloc_ros.files import write_text
-from limbloc_ros.rig.formats.common import CAMERA_TO_WORLD, Format, FoundCamera, Reading, only_file
+from limbloc_ros.rig.formats.common import WORLD_TO_CAMERA, Format, FoundCamera, Reading, only_file
 from limbloc_ros.rig.rig_file import load_rig
 
 
@@ -18,10 +18,10 @@ def read(paths: Sequence[Path]) -> Reading:
     """Read one file; it is also what `load_rig` reads directly."""
     path = only_file(paths, "calib.json")
     cameras = tuple(
-        FoundCamera(c.name, (c.width, c.height), c.K, c.distortion, c.distortion_model, c.T_world_camera)
+        FoundCamera(c.name, (c.width, c.height), c.K, c.distortion, c.distortion_model, c.T_camera_world)
         for c in load_rig(path).cameras
     )
-    return Reading(str(path), cameras, CAMERA_TO_WORLD, 1.0, "room")
+    return Reading(str(path), cameras, WORLD_TO_CAMERA, 1.0, "room")
 
 
 def write(rig: Rig, path: Path) -> list[str]:
