@@ -15,7 +15,6 @@ NODES = (
     "replay",
     "record",
     "composed",
-    "smart_space",
     "foxglove_bridge",
 )
 
@@ -81,8 +80,9 @@ setup(
     zip_safe=False,
     entry_points={
         "console_scripts": [
-            "limbloc = limbloc_ros.cli:main",
-            *(f"{node} = {NAME}.nodes.{node}:main" for node in NODES),
+            f"limbloc = {NAME}.cli:main",
+            f"smart_space = {NAME}.nodes.smart_space:main",
+            *(f"{node} = {NAME}.nodes.start:{node}" for node in NODES),
         ],
     },
 )

@@ -10,9 +10,11 @@
 """
 
 import argparse
+import atexit
 import os
 import shlex
 import tempfile
+import time
 from pathlib import Path
 
 from launch.actions import (
@@ -22,8 +24,9 @@ from launch.actions import (
     OpaqueFunction,
     RegisterEventHandler,
     SetEnvironmentVariable,
+    TimerAction,
 )
-from launch.event_handlers import OnProcessExit, OnShutdown
+from launch.event_handlers import OnProcessExit
 from launch.events import Shutdown
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
@@ -32,7 +35,7 @@ from launch import LaunchDescription
 from limbloc_ros.nodes.graph_plan import plan_graph
 from limbloc_ros.nodes.smart_space import config_from_arguments
 from limbloc_ros.ros.environment import config_file, graph_environment
-from limbloc_ros.ros.supervisor import REFUSED, enclave_of
+from limbloc_ros.ros.supervisor import End, RestartDelay, enclave_of, meaning_of
 
 ARGUMENTS = {
     "config": ("", "smart space file; empty: the installed config/smart_space.yaml"),
@@ -48,17 +51,44 @@ ARGUMENTS = {
 YES = ("true", "1", "yes")
 
 
-def when_over(plan):
-    """What to do when a process has ended: stop everything if it refused its parameters, or if the bag is over."""
+class Process:
+    """One process of the plan, started again when it dies, after the delays of `smart_space`.
 
-    def decide(event, _context):
-        if event.returncode == REFUSED:
-            return EmitEvent(event=Shutdown(reason=f"{plan.name} cannot run as configured; see its message above"))
-        if plan.ends_graph and event.returncode == 0:
-            return EmitEvent(event=Shutdown(reason=f"{plan.name} has ended"))
-        return None
+    `respawn` of launch knows one delay only, and would start a process again that has refused its parameters.
+    """
 
-    return decide
+    def __init__(self, plan, config):
+        self.plan, self.config = plan, config
+        self.delay = RestartDelay(config)
+        self.node, self.began_s = None, 0.0
+
+    def begin(self, _context=None):
+        """The action that starts it; launch wants a new one each time."""
+        self.began_s = time.monotonic()
+        self.node = Node(
+            package="limbloc_ros",
+            executable="composed",
+            exec_name=self.plan.name,
+            arguments=[self.plan.description],
+            additional_env=enclave_of(self.plan.name, os.environ),
+            output="screen",
+            sigterm_timeout=str(self.config.interrupt_s),
+            sigkill_timeout=str(self.config.terminate_s),
+        )
+        return [self.node]
+
+    def when_over(self, event, context):
+        """What to do when it has ended: nothing, start it again, or stop everything."""
+        name, end = self.plan.name, meaning_of(self.plan, event.returncode)
+        if end is End.REFUSED:
+            return EmitEvent(event=Shutdown(reason=f"{name} cannot run as configured; see its message above"))
+        if end is End.OVER:
+            return EmitEvent(event=Shutdown(reason=f"{name} has ended"))
+        if end is End.DONE or context.is_shutdown:
+            return None
+        delay_s = self.delay.after(time.monotonic() - self.began_s)
+        again = TimerAction(period=delay_s, actions=[OpaqueFunction(function=self.begin)])
+        return [LogInfo(msg=f"{name} died; starting it again in {delay_s:g} s"), again]
 
 
 def start(context):
@@ -70,35 +100,18 @@ def start(context):
     options["foxglove"] = port if port or foxglove in YES else None
     config = config_from_arguments(argparse.Namespace(**options, set=shlex.split(given["set"])))
     folder = tempfile.TemporaryDirectory(prefix="limbloc_")
+    atexit.register(folder.cleanup)  # not sooner: at the shutdown processes may still be reading
     plans = plan_graph(config, Path(folder.name))
 
     actions = [SetEnvironmentVariable(name, value) for name, value in graph_environment(config.network).items()]
-    for plan in plans:
-        # A replay or a recording ends by itself; everything else is started again when it dies.
-        finite = all(node["kind"] in ("replay", "record") for node in plan.nodes)
-        process = Node(
-            package="limbloc_ros",
-            executable="composed",
-            exec_name=plan.name,
-            arguments=[plan.description],
-            additional_env=enclave_of(plan.name, os.environ),
-            output="screen",
-            respawn=not finite,
-            respawn_delay=config.processes.restart_delay_s,
-            sigterm_timeout=str(config.processes.interrupt_s),
-            sigkill_timeout=str(config.processes.terminate_s),
-        )
-        actions.append(process)
-        actions.append(RegisterEventHandler(OnProcessExit(target_action=process, on_exit=when_over(plan))))
+    for process in [Process(plan, config.processes) for plan in plans]:
+        actions += process.begin()
+        ours = OnProcessExit(target_action=lambda action, p=process: action is p.node, on_exit=process.when_over)
+        actions.append(RegisterEventHandler(ours))
     if given["rviz"].lower() in YES:
         actions.append(
             Node(package="rviz2", executable="rviz2", arguments=["-d", str(config_file("limbloc.rviz"))], output="log")
         )
-
-    def clean_up(_event, _context):
-        folder.cleanup()
-
-    actions.append(RegisterEventHandler(OnShutdown(on_shutdown=clean_up)))
     return [LogInfo(msg=f"smart space: source {config.source}, {len(plans)} processes"), *actions]
 
 

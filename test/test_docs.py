@@ -93,7 +93,7 @@ def unknown_options(line):
 
 def executables():
     nodes = re.search(r"^NODES = \((.+?)\)", SETUP, re.MULTILINE | re.DOTALL)[1]
-    return {"limbloc", *re.findall(r'"(\w+)"', nodes)}
+    return {"limbloc", "smart_space", *re.findall(r'"(\w+)"', nodes)}
 
 
 SETUP = (ROOT / "setup.py").read_text(encoding="utf-8")

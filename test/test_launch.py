@@ -6,6 +6,7 @@ The launch file starts what `plan_graph` says; test_smart_space.py runs those pl
 
 import argparse
 import ast
+import atexit
 import re
 import runpy
 import sys
@@ -22,6 +23,7 @@ from limbloc_ros.nodes.composed import KINDS, flatten
 from limbloc_ros.nodes.graph_plan import NODE_SECTIONS, SmartSpaceConfig, plan_graph
 from limbloc_ros.rig.rig_file import load_rig
 from limbloc_ros.ros.environment import graph_environment, share_folder
+from limbloc_ros.ros.supervisor import REFUSED
 
 ROOT = Path(limbloc_ros.__file__).parent.parent
 LAUNCH = ROOT / "launch" / "smart_space.launch.py"
@@ -70,9 +72,13 @@ def launched(monkeypatch):
                 for alias in node.names:
                     setattr(made, alias.name, type(alias.name, (Stand,), {}))
         monkeypatch.setitem(sys.modules, module, made)
+    at_exit = []
+    monkeypatch.setattr(atexit, "register", at_exit.append)
     file = runpy.run_path(str(LAUNCH))
     defaults = {name: default for name, (default, _) in launch_arguments().items()}
-    return lambda **given: file["start"]({**defaults, **given})
+    yield lambda **given: file["start"]({**defaults, **given})
+    for clean_up in at_exit:
+        clean_up()
 
 
 @pytest.mark.parametrize(
@@ -113,12 +119,32 @@ def test_the_launch_file_starts_what_the_command_line_starts(launched, given, wo
         )
         assert theirs == ours
         assert process.options["additional_env"] == {"ROS_SECURITY_ENCLAVE_OVERRIDE": f"/limbloc/{plan.name}"}
-    (over,) = [a.args[0] for a in actions if a.args and type(a.args[0]).__name__ == "OnShutdown"]
-    over.options["on_shutdown"](None, None)  # removes that folder
     told = {a.args for a in actions if type(a).__name__ == "SetEnvironmentVariable"}
     assert told == set(graph_environment(config.network).items())
     options = {action.dest for action in parser._actions} - {"help"}
     assert options <= set(launch_arguments())
+
+
+def test_what_dies_is_started_again_ever_later_and_what_refused_ends_everything(launched):
+    """As the supervisor does it (test_smart_space.py); tried with ROS 2's own launch as well."""
+    actions = launched()
+    node = next(action for action in actions if type(action).__name__ == "Node")
+    handlers = [a.args[0].options for a in actions if a.args and type(a.args[0]).__name__ == "OnProcessExit"]
+    (over,) = [options for options in handlers if options["target_action"](node)]
+    ended, running = types.SimpleNamespace(returncode=-9), types.SimpleNamespace(is_shutdown=False)
+    for seconds in (1.0, 2.0, 4.0):
+        said, timer = over["on_exit"](ended, running)
+        assert said.options["msg"].endswith(f"died; starting it again in {seconds:g} s")
+        assert timer.options["period"] == seconds
+        (begin,) = timer.options["actions"]
+        (again,) = begin.options["function"](None)
+        assert again.options == node.options
+        assert over["target_action"](again)
+        assert not over["target_action"](node)
+        node = again
+    assert over["on_exit"](ended, types.SimpleNamespace(is_shutdown=True)) is None
+    stop = over["on_exit"](types.SimpleNamespace(returncode=REFUSED), running)
+    assert "cannot run as configured" in stop.options["event"].options["reason"]
 
 
 def test_everything_the_launch_file_imports_from_us_exists():

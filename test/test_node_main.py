@@ -41,6 +41,69 @@ def test_a_signal_in_the_middle_of_work_ends_the_process_cleanly(graph: Graph, n
     assert "Traceback" not in output
 
 
+IMPATIENT = """
+import os, signal, sys
+class Finder:
+    def find_spec(self, name, path=None, target=None):
+        if name == "{module}":
+            os.kill(os.getpid(), signal.{name})
+sys.meta_path.insert(0, Finder())
+sys.argv = ["{command}", '{{"nodes": [{{"kind": "carving"}}]}}']
+from limbloc_ros.nodes.start import {command}
+sys.exit({command}())
+"""
+
+
+@pytest.mark.parametrize(
+    ("command", "module", "name"),
+    [
+        ("carving", "numpy", "SIGINT"),
+        ("composed", "rclpy", "SIGTERM"),
+        ("composed", "limbloc_ros.nodes.carving", "SIGINT"),  # the kinds' modules come before any node is made
+    ],
+)
+def test_a_signal_while_modules_are_imported_ends_the_process_quietly(command: str, module: str, name: str) -> None:
+    """`ros2 launch` interrupts what it has just started when another node refuses its parameters."""
+    script = IMPATIENT.format(command=command, module=module, name=name)
+    ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=False)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (0, "", "")
+
+
+INTERRUPTED = "os.kill(os.getpid(), signal.SIGINT)"
+
+
+@pytest.mark.parametrize(
+    ("body", "returncode", "said"),
+    [
+        (INTERRUPTED, 0, ""),
+        (f"try: {INTERRUPTED}\n  except KeyboardInterrupt: raise ImportError('numpy failed')", 0, ""),
+        ("raise ImportError('no such module')", 1, "ImportError: no such module"),
+        (f"raise InputError(Late('{INTERRUPTED}'))", REFUSED, "too late"),  # while it is said why the start failed
+    ],
+)
+def test_a_signal_while_nodes_are_made_ends_the_process_cleanly(body: str, returncode: int, said: str) -> None:
+    """Also where an import makes an ImportError of it, as numpy's does; any other ImportError is told."""
+    script = f"""
+import os, signal, sys
+from limbloc_ros.core.errors import InputError
+class Late(str):
+  def __str__(self):
+    exec(self)
+    return "too late"
+def make():
+  {body}
+from limbloc_ros.ros.node_main import main
+sys.exit(main(make, []))
+"""
+    env = {**os.environ, "ROS_DOMAIN_ID": str(DOMAIN)}
+    ended = subprocess.run(
+        [sys.executable, "-c", script], env=env, capture_output=True, text=True, timeout=60, check=False
+    )
+    assert ended.returncode == returncode
+    assert said in ended.stderr
+    assert bool(said) == bool(ended.stderr)
+
+
 def test_a_bad_parameter_is_one_line_not_a_trace() -> None:
     process = start("number_of_cameras:=99")
     output, _ = process.communicate(timeout=30)

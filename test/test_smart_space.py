@@ -4,6 +4,7 @@
 import argparse
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -25,10 +26,11 @@ from limbloc_ros.nodes import composed, process_server, smart_space
 from limbloc_ros.nodes.graph_plan import SmartSpaceConfig, load_config, plan_graph
 from limbloc_ros.recordings.bags import BagReader, BagWriter
 from limbloc_ros.rig.rig_file import load_rig, save_rig
+from limbloc_ros.ros import shared_memory
 from limbloc_ros.ros import supervisor as supervising
 from limbloc_ros.ros.environment import NetworkConfig, config_file, graph_environment
 from limbloc_ros.ros.process_starter import ProcessStarter, StartedProcess
-from limbloc_ros.ros.supervisor import ProcessConfig, ProcessPlan, Supervisor
+from limbloc_ros.ros.supervisor import SETTLED_S, ProcessConfig, ProcessPlan, RestartDelay, Supervisor
 from limbloc_ros.simulation.room import default_rig
 
 DOMAIN = 1 + os.getpid() % 100
@@ -283,16 +285,28 @@ def observer(monkeypatch):
     context.try_shutdown()
 
 
-def test_a_killed_process_is_started_again_and_works(observer):
+def shared_memory_of(pid):
+    """The segments that a process has made: it holds their locks."""
+    files = [Path(f"/proc/{pid}/fd/{name}").resolve() for name in os.listdir(f"/proc/{pid}/fd")]
+    return [Path(str(file).removesuffix("_el")) for file in files if re.fullmatch(r"fastrtps_\w{16}_el", file.name)]
+
+
+def test_a_killed_process_is_started_again_and_works(observer, monkeypatch):
+    monkeypatch.setattr(shared_memory, "YOUNG_S", 0.0)
     lines = Lines()
     plans = [plan("cameras_1", segmentation("cam0"), segmentation("cam1")), plan("cameras_2", segmentation("cam2"))]
     with Supervisor(plans, graph_environment(NETWORK), FAST, lines.append) as supervisor:
         names = {"segmentation_cam0", "segmentation_cam1", "segmentation_cam2"}
         wait_until(lambda: supervisor.poll() and names <= set(observer.get_node_names()))
         before = supervisor.pids
+        dead, alive = shared_memory_of(before["cameras_1"]), shared_memory_of(before["cameras_2"])
+        assert dead
+        assert alive
         os.kill(before["cameras_1"], signal.SIGKILL)
         lines.wait_for(supervisor, "cameras_1 died (SIGKILL); starting it again in 0.2 s")
         wait_until(lambda: supervisor.poll() and supervisor.restarts["cameras_1"] == 1)
+        assert not any(segment.exists() for segment in dead)
+        assert all(segment.exists() for segment in alive)
         after = supervisor.pids
         assert after["cameras_1"] != before["cameras_1"]
         assert after["cameras_2"] == before["cameras_2"]
@@ -342,6 +356,15 @@ def test_the_delay_grows_while_a_process_keeps_dying():
     delays = [line.rsplit(" in ", 1)[1] for line in lines if "starting it again" in line]
     assert delays[:3] == ["0.1 s", "0.2 s", "0.3 s"]
     assert any(line.startswith("[broken] ") for line in lines)
+
+
+def test_a_process_may_keep_dying_for_days():
+    delay = RestartDelay(ProcessConfig())
+    assert [delay.after(5.0) for _ in range(7)] == [1.0, 2.0, 4.0, 8.0, 16.0, 30.0, 30.0]
+    assert {delay.after(0.0) for _ in range(3000)} == {30.0}
+    assert delay.after(SETTLED_S) == 1.0
+    never = RestartDelay(ProcessConfig(restart_delay_s=0.0))
+    assert {never.after(0.0) for _ in range(3000)} == {0.0}
 
 
 def test_a_wrong_parameter_ends_the_graph_with_its_message():

@@ -85,6 +85,10 @@ def run(argv: Sequence[str] | None = None) -> int:
     except ConfigError as error:
         print(error, file=sys.stderr)
         return REFUSED
+    entries = [entry for entry in description["nodes"] if isinstance(entry, Mapping)]
+    for kind in KINDS:  # before there is anything to clean up: see nodes/start.py
+        if any(entry.get("kind") == kind for entry in entries):
+            import_module(f"limbloc_ros.nodes.{kind}")
     nodes: list[Node] = []
 
     def make() -> list[Node]:
@@ -96,7 +100,7 @@ def run(argv: Sequence[str] | None = None) -> int:
         return bool(ends) and all(end.is_set() for end in ends)
 
     # `until` is looked at after every callback, so it is only given where a node can end by itself.
-    finite = any(isinstance(entry, Mapping) and entry.get("kind") in FINITE for entry in description["nodes"])
+    finite = any(entry.get("kind") in FINITE for entry in entries)
     code = node_main.main(make, everything, over if finite else None)
     for node in nodes:
         if hasattr(node, "summary"):

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import gc
 import signal
 import time
 from collections.abc import Callable, Sequence
@@ -99,31 +100,43 @@ def main(
     """
     cv2.setNumThreads(1)  # one process per stage already uses the cores; OpenCV's pool only adds waiting
     nodes: Sequence[Node] = ()
-    spinning = stopped = False
+    code = 0
+    making = stopped = False
 
     def on_signal(number: int, frame: FrameType | None) -> None:
         nonlocal stopped
         stopped = True
-        if not spinning:  # a start that compiles kernels takes a while; nobody wants to wait for its end
+        if making:  # a start that compiles kernels takes a while; nobody wants to wait for its end
             interrupt(number, frame)
 
-    # rclpy's own handlers invalidate the context at once, and a callback that is just publishing then fails.
-    rclpy.init(args=None if args is None else list(args), signal_handler_options=SignalHandlerOptions.NO)
+    def make() -> Sequence[Node]:
+        nonlocal making
+        making = not stopped
+        try:
+            made = make_nodes() if making else ()
+        finally:
+            making = False  # what comes now, also the word about what went wrong, comes to its end
+        return [made] if isinstance(made, Node) else made
+
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, on_signal)
     try:
+        # rclpy's own handlers invalidate the context at once, and a callback that is just publishing then fails.
+        rclpy.init(args=None if args is None else list(args), signal_handler_options=SignalHandlerOptions.NO)
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGTERM})  # see nodes/process_server.py
-        made = make_nodes()
-        nodes = [made] if isinstance(made, Node) else made
-        spinning = True
+        nodes = make()
         spin(nodes, until=lambda: stopped or (until is not None and until()))
     except LimblocError as error:
         get_logger("limbloc").fatal(str(error))
-        return REFUSED
+        code = REFUSED
     except KeyboardInterrupt:
         pass
+    except ImportError:
+        if not stopped:  # numpy's C modules make one of an interrupt
+            raise
     finally:
         for node in nodes:
             node.destroy_node()
         rclpy.try_shutdown()
-    return 0
+    gc.collect()  # the rest of a node that was not finished, whose shared memory would stay
+    return code

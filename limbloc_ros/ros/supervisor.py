@@ -16,15 +16,19 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from enum import Enum
 from types import FrameType
 from typing import IO, Any
 
 from limbloc_ros.core.config import setting
 from limbloc_ros.ros.process_starter import SERVER, ProcessStarter, StartedProcess
+from limbloc_ros.ros.shared_memory import remove_abandoned
 
 POLL_S = 0.1
 #: A process that has run this long starts with the short delay again when it dies.
 SETTLED_S = 30.0
+#: Abandoned shared memory that is worth a word at the start.
+ABANDONED_MB = 64
 #: SROS2 enclaves of the processes lie below this path; see docs/how_to/security.md.
 ENCLAVES = "/limbloc"
 #: Exit code of `nodes.composed` when a node refused its parameters or input.
@@ -62,17 +66,53 @@ class ProcessPlan:
         return json.dumps({"namespace": self.namespace, "nodes": list(self.nodes)})
 
 
+class End(Enum):
+    """What the end of a process means."""
+
+    REFUSED = "it cannot run as configured, and neither can the graph"
+    OVER = "it has done its work, and the graph with it"
+    DONE = "it has done its work; the others go on"
+    DIED = "it is to be started again"
+
+
+def meaning_of(plan: ProcessPlan, code: int) -> End:
+    """What it means that a process of this plan has ended with this exit code (or minus the signal)."""
+    if code == REFUSED:
+        return End.REFUSED
+    if code == 0 and plan.ends_graph:
+        return End.OVER
+    if code == 0 and all(node["kind"] in ("replay", "record") for node in plan.nodes):
+        return End.DONE
+    return End.DIED
+
+
+class RestartDelay:
+    """How long to wait before one process is started again: twice as long each time, while it keeps dying."""
+
+    def __init__(self, config: ProcessConfig) -> None:
+        self._config = config
+        self._next_s = config.restart_delay_s
+
+    def after(self, lived_s: float) -> float:
+        """The delay, s, when it has died after so long, s."""
+        if lived_s >= SETTLED_S:
+            self._next_s = self._config.restart_delay_s
+        delay = min(self._next_s, self._config.restart_max_delay_s)
+        self._next_s = 2.0 * delay
+        return delay
+
+
 class _Child:
     """One process and what we know of its past."""
 
-    def __init__(self, plan: ProcessPlan) -> None:
+    def __init__(self, plan: ProcessPlan, config: ProcessConfig) -> None:
         self.plan = plan
+        self.delay = RestartDelay(config)
         self.process: StartedProcess | None = None
         self.requested = False
         self.reader: threading.Thread | None = None
         self.started_s = 0.0
         self.restart_at_s: float | None = None
-        self.deaths = 0
         self.finished = False
 
 
@@ -104,7 +144,7 @@ class Supervisor:
         self._starter = ProcessStarter(self._environment)
         self._server: subprocess.Popen[str] | None = None
         self._say = say or _print
-        self._children = [_Child(plan) for plan in plans]
+        self._children = [_Child(plan, self.config) for plan in plans]
         self._stop = threading.Event()
         self._hurry = threading.Event()
 
@@ -128,6 +168,8 @@ class Supervisor:
 
     def start(self) -> None:
         """Have all processes started, in their order; `poll` sees when they run."""
+        if (freed := remove_abandoned()) > ABANDONED_MB << 20:
+            self._say(f"removed {freed >> 20} MB of shared memory that killed DDS processes had left")
         try:
             for child in self._children:
                 self._request(child)
@@ -196,6 +238,7 @@ class Supervisor:
             if child.reader is not None:
                 child.reader.join()
             child.restart_at_s, child.requested = None, False
+        remove_abandoned()  # of what refused its parameters in the middle of its start, or had to be killed
 
     def _request(self, child: _Child) -> None:
         name = child.plan.name
@@ -243,26 +286,25 @@ class Supervisor:
     def _died(self, child: _Child, code: int, now: float) -> bool:
         """A child has ended: plan its restart. False when that ends the graph."""
         name = child.plan.name
-        if code == REFUSED:
+        end = meaning_of(child.plan, code)
+        if end is End.REFUSED:
             self.failure = f"{name} cannot run as configured; see its message above"
             return False
-        if code == 0 and child.plan.ends_graph:
+        if end is End.OVER:
             self._say(f"{name} has ended, and the smart space with it")
             return False
-        if code == 0 and all(node["kind"] in ("replay", "record") for node in child.plan.nodes):
+        if end is End.DONE:
             self._say(f"{name} has ended")
             child.finished = True
             return True
         assert child.process is not None
         child.process.signal_group(signal.SIGKILL)  # whatever the dead process may have started
-        if now - child.started_s >= SETTLED_S:
-            child.deaths = 0
-        self._restart_later(child, _cause(code), now)
+        remove_abandoned()
+        self._restart_later(child, _cause(code), now, now - child.started_s)
         return True
 
-    def _restart_later(self, child: _Child, cause: str, now: float) -> None:
-        delay = min(self.config.restart_delay_s * 2.0**child.deaths, self.config.restart_max_delay_s)
-        child.deaths += 1
+    def _restart_later(self, child: _Child, cause: str, now: float, lived_s: float = 0.0) -> None:
+        delay = child.delay.after(lived_s)
         child.restart_at_s = now + delay
         self._say(f"{child.plan.name} died ({cause}); starting it again in {delay:g} s")
 
