@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What killed DDS processes leave in shared memory is removed, and nothing else. test_smart_space.py kills real ones."""
+"""What killed DDS processes leave in shared memory is removed, nothing else. test_smart_space.py kills real ones."""
 
 from __future__ import annotations
 

@@ -287,7 +287,7 @@ def observer(monkeypatch):
 
 def shared_memory_of(pid):
     """The segments that a process has made: it holds their locks."""
-    files = [Path(f"/proc/{pid}/fd/{name}").resolve() for name in os.listdir(f"/proc/{pid}/fd")]
+    files = [file.resolve() for file in Path(f"/proc/{pid}/fd").iterdir()]
     return [Path(str(file).removesuffix("_el")) for file in files if re.fullmatch(r"fastrtps_\w{16}_el", file.name)]
 
 
