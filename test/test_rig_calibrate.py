@@ -18,7 +18,7 @@ from limbloc_ros.core.errors import ConfigError, RigError
 from limbloc_ros.rig.advice import assess, what_to_record
 from limbloc_ros.rig.board import parse_board
 from limbloc_ros.rig.bundle import Bundle, Lens, View, _Layout, _view
-from limbloc_ros.rig.calibration import calibrate
+from limbloc_ros.rig.calibration import calibrate, calibrate_lens
 from limbloc_ros.rig.formats import FORMATS
 from limbloc_ros.rig.rig_file import load_rig
 from limbloc_ros.simulation.room import default_rig
@@ -101,6 +101,22 @@ def test_misread_corners_and_a_camera_out_of_time_do_not_bend_the_rest():
     assert place.max() < 3e-3
     assert turn.max() < 0.15
     assert any("off the other cameras" in line for line in dirty.dropped)
+
+
+def test_a_single_misread_corner_is_thrown_away_and_its_view_kept():
+    """As OpenCV reads a corner that lies beyond the image's edge: far off, in a view that is good otherwise."""
+    rng = np.random.default_rng(3)
+    rig = default_rig(2, 1920, 1080)
+    views = [view for view in rig_boards.near(rig, BOARD, 8, 0.2, rng) if view.camera == 0]
+    clean, _, _, _ = calibrate_lens("cam0", (1920, 1080), views, BOARD)
+    views[5].places[0] += [17.0, -4.0]
+    camera, used, residuals, dropped = calibrate_lens("cam0", (1920, 1080), views, BOARD)
+    assert [len(view.ids) for view in views] == [len(view.ids) + (i == 5) for i, view in enumerate(used)]
+    assert [len(r) for r in residuals] == [len(view.ids) for view in used]
+    assert np.sqrt(np.mean(np.concatenate(residuals) ** 2)) < 0.25
+    assert abs(camera.K[0, 0] / clean.K[0, 0] - 1) < 1e-3
+    (said,) = dropped
+    assert re.match(r"cam0, frame 5: 1 of \d+ corners, 1\d\.\d px off: misread", said)
 
 
 def test_fisheye_and_rational_lenses():
@@ -212,8 +228,13 @@ def test_from_images_to_a_rig_file_and_a_report(recording, tmp_path, capsys):
 def test_lenses_alone(recording, tmp_path, capsys):
     folder, truth = recording
     command = ["rig", "calibrate", str(folder), "--board", SMALL_BOARD, "--intrinsics-only", "--out", str(tmp_path)]
-    assert cli.main([*command, "--cameras", "cam0"]) == 0
-    assert "cam0: " in capsys.readouterr().out
+    assert cli.main([*command, "--cameras", "cam0", "--report", str(tmp_path / "about")]) == 0
+    said = capsys.readouterr().out
+    assert "cam0: " in said
+    assert f"report: {tmp_path / 'about' / 'calibration.html'}" in said
+    page = (tmp_path / "about" / "calibration.html").read_text()
+    assert page.count("data:image/png") == 1  # where the board was; a lens alone has no room
+    assert "place mm" not in page
     camera = FORMATS["ros"].read([tmp_path / "cam0.yaml"]).cameras[0]
     assert abs(camera.K[0, 0] / truth.cameras[0].K[0, 0] - 1) < 0.02
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -12,7 +13,7 @@ import numpy as np
 from tqdm import tqdm
 
 from limbloc_ros.commands.rig_import import describe
-from limbloc_ros.core.camera import Rig
+from limbloc_ros.core.camera import Camera, Rig
 from limbloc_ros.core.errors import ConfigError, InputError, OutputError, RigError
 from limbloc_ros.files import write_bytes, write_text
 from limbloc_ros.recordings.image_sets import count_sets, find_cameras, image_sets
@@ -66,9 +67,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out", type=Path, help="rig file to write (default: rig.yaml), or folder with --intrinsics-only (lenses)"
     )
-    parser.add_argument(
-        "--report", type=Path, metavar="DIR", help="folder of the report (default: beside the rig file)"
-    )
+    parser.add_argument("--report", type=Path, metavar="DIR", help="folder of the report (default: beside OUT)")
     parser.add_argument("--cameras", nargs="+", metavar="CAM", help="only these (default: all in RECORDING)")
     parser.add_argument("--lens", choices=LENSES, default="radtan", help="lens model (default: radtan, k1 k2 p1 p2)")
     parser.add_argument("--intrinsics", type=Path, metavar="DIR", help="another recording, for the lenses only")
@@ -165,22 +164,34 @@ def _lenses_only(
     sizes: dict[str, tuple[int, int]],
     views: Sequence[View],
 ) -> int:
+    missing = [name for name in names if name not in sizes]
+    if missing:
+        raise RigError(f"{args.recording}: no image of camera {', '.join(missing)} can be read")
+    cameras: list[Camera] = []
+    every, residuals_of_all, thrown, advice = [], [], [], []
     for c, name in enumerate(names):
-        if name not in sizes:
-            raise RigError(f"{args.recording}: no image of camera {name} can be read")
         mine = [view for view in views if view.camera == c]
         camera, used, residuals, dropped = calibrate_lens(name, sizes[name], mine, board, args.lens)
         write_intrinsics(camera, out / f"{name}.yaml")
-        one = Calibration((camera,), used, residuals, np.zeros(1), np.zeros(1), {}, [], dropped)
-        quality = assess(one)
+        quality = assess(Calibration((camera,), used, residuals, np.zeros(1), np.zeros(1), {}, [], dropped))
+        better = what_to_record(quality, 0, alone=True)
         K = camera.K
         print(
             f"  {name}: {len(used)} views, {quality[0].rms_px:.3f} px, {100 * quality[0].coverage:.0f} % of the image; "
             f"fx {K[0, 0]:.1f} fy {K[1, 1]:.1f} cx {K[0, 2]:.1f} cy {K[1, 2]:.1f}, "
             f"distortion {camera.distortion.round(4).tolist()}"
         )
-        _say(dropped, what_to_record(quality, 0, alone=True), [])
-    print(f"lenses: {out}")
+        _say(dropped, better, [])
+        cameras.append(camera)
+        every += [replace(view, camera=c) for view in used]
+        residuals_of_all += residuals
+        thrown += dropped
+        advice += better
+    zeros = np.zeros(len(cameras))
+    result = Calibration(tuple(cameras), every, residuals_of_all, zeros, zeros, {}, [], thrown)
+    folder = args.report or out.with_name(f"{out.name}_calibration")
+    page = write_report(result, None, assess(result), advice, folder, args.board)
+    print(f"lenses: {out}\nreport: {page}")
     return 0
 
 
@@ -189,12 +200,14 @@ def _say(dropped: Sequence[str], advice: Sequence[str], floor_frames: Sequence[i
         shown = ", ".join(map(str, floor_frames[:6])) + (" ..." if len(floor_frames) > 6 else "")
         print(f"  floor: the board lies on it in {len(floor_frames)} frame(s): {shown}")
     if dropped:
-        print(f"  thrown away: {len(dropped)} view(s), such as {dropped[0]}")
+        print(f"  thrown away: {dropped[0]}" + (f" (and {len(dropped) - 1} more)" if len(dropped) > 1 else ""))
     for line in advice:
         print(f"  better: {line}")
 
 
 _HEAD = ("camera", "views", "corners", "rms px", "95 % px", "image %", "tilt deg", "common", "place mm", "gaze deg")
+#: So many columns say something of a lens alone.
+_ALONE = 6
 
 
 def _cells(q: CameraQuality) -> list[str]:
@@ -222,9 +235,14 @@ def quality_table(qualities: Sequence[CameraQuality]) -> str:
 
 
 def write_report(
-    result: Calibration, rig: Rig, qualities: Sequence[CameraQuality], advice: Sequence[str], folder: Path, board: str
+    result: Calibration,
+    rig: Rig | None,
+    qualities: Sequence[CameraQuality],
+    advice: Sequence[str],
+    folder: Path,
+    board: str,
 ) -> Path:
-    """Write pictures and page into `folder`, and return the page.
+    """Write pictures and page into `folder`, and return the page; without a rig it is about lenses alone.
 
     Raises:
         OutputError: the folder cannot be written.
@@ -233,33 +251,38 @@ def write_report(
     from limbloc_ros.rig.pictures import coverage_picture, rig_picture
 
     places, errors = [], []
-    for c in range(len(rig.cameras)):
+    for c in range(len(result.cameras)):
         mine = [(v, r) for v, r in zip(result.views, result.residuals, strict=True) if v.camera == c]
         places.append(np.concatenate([v.places for v, _ in mine]))
         errors.append(np.concatenate([np.linalg.norm(r, axis=1) for _, r in mine]))
-    pictures = {
-        "rig.png": rig_picture(rig.cameras, rig.volume_min, rig.volume_max),
-        "coverage.png": coverage_picture(rig.cameras, places, errors, [q.cells for q in qualities]),
-    }
+    pictures = {"coverage.png": coverage_picture(result.cameras, places, errors, [q.cells for q in qualities])}
+    head, among_each_other = _HEAD[:_ALONE], ""
+    if rig is not None:
+        pictures["rig.png"] = rig_picture(rig.cameras, rig.volume_min, rig.volume_max)
+        head, among_each_other = _HEAD, (
+            " Place and gaze are standard deviations of the cameras among each other, as the residuals suggest; common "
+            "are the frames shared with the best neighbour."
+        )  # fmt: skip
     verdict = "Nothing to improve." if not advice else ""
     sections = [
-        Section("quality", "How good it is", f"Root mean square error {result.rms_px():.3f} px. Place and gaze are "
-                "standard deviations of the cameras among each other, as the residuals suggest; common are the frames "
-                "shared with the best neighbour.",
-                tables=[Table([_cells(q) for q in qualities], _HEAD)]),
+        Section("quality", "How good it is", f"Root mean square error {result.rms_px():.3f} px.{among_each_other}",
+                tables=[Table([_cells(q)[: len(head)] for q in qualities], head)]),
         Section("again", "What to record again", verdict, tables=[Table([(f"{i + 1}", line) for i, line in
                 enumerate(advice)])] if advice else ()),
         Section("coverage", "Where the board was", "Corners in each image, coloured by their distance from where the "
                 "calibrated camera sees them. Red cells saw no board: there the lens is a guess.",
                 pictures["coverage.png"], "board corners in every camera's image", wide=True),
-        Section("rig", "The room", "Cameras with what they see, the carve volume (dotted) and a person of 1.75 m for "
-                "scale; from the side and from above. Red, green and blue are x, y and z at the origin.",
-                pictures["rig.png"], "the cameras in 3D", wide=True),
     ]  # fmt: skip
+    if rig is not None:
+        sections.append(
+            Section("rig", "The room", "Cameras with what they see, the carve volume (dotted) and a person of 1.75 m "
+                    "for scale; from the side and from above. Red, green and blue are x, y and z at the origin.",
+                    pictures["rig.png"], "the cameras in 3D", wide=True)
+        )  # fmt: skip
     if result.dropped:
         rows = [(f"{i + 1}", line) for i, line in enumerate(result.dropped)]
-        sections.append(Section("dropped", "Thrown away", "Views that did not fit.", tables=[Table(rows)]))
-    about = [f"{len(rig.cameras)} cameras, {len(result.views)} views of {board}"]
+        sections.append(Section("dropped", "Thrown away", "Views and corners that did not fit.", tables=[Table(rows)]))
+    about = [f"{len(result.cameras)} cameras, {len(result.views)} views of {board}"]
     for name, data in pictures.items():
         write_bytes(folder / name, data)
     page = folder / "calibration.html"

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -31,6 +31,9 @@ MIN_LENS_VIEWS = 4
 #: A view whose corners are off by more than this (px, root mean square) after the first fit is thrown away, as are
 #: those far beyond what is usual.
 BAD_VIEW_PX, BAD_VIEW_TIMES = 3.0, 4.0
+#: So is a corner that is so many times as far off as its view's median corner, where at most this share of them is: one
+#: at the image's edge, or under a finger. Many are no misreading but a lens of another model.
+BAD_CORNER_TIMES, BAD_CORNERS = 8.0, 0.1
 #: The board lies on the floor when nothing is further below it than this (m), and its normal is as upright as this.
 BELOW_FLOOR_M, UPRIGHT_RAD = 0.03, np.radians(40.0)
 
@@ -46,7 +49,7 @@ class Calibration:
         sigma_m, sigma_rad: [C] standard deviation of each camera's position and rotation among the others.
         boards: frame -> T_world_board [4, 4].
         floor_frames: those in which the board lay on the floor; empty when the world is a camera's.
-        dropped: views that were thrown away, and why.
+        dropped: views and corners that were thrown away, and why.
     """
 
     cameras: tuple[Camera, ...]
@@ -109,6 +112,7 @@ def calibrate(
             done.bundle.lenses, done.bundle.cameras, {f: b for f, b in done.bundle.boards.items() if f in frames}
         )
         done = adjust(rest, used, board.points, reference)
+    used, done = _without_misread_corners(names, used, done, board, reference, dropped)
     T_cameras = [_matrix(pose) for pose in done.bundle.cameras]
     synchronous = {view.frame for view in views}
     T_boards = {f: _matrix(pose) for f, pose in done.bundle.boards.items() if f in synchronous}
@@ -150,8 +154,9 @@ def calibrate_lens(
     lenses, poses, dropped = first_lenses([name], [size], numbered, board, lens)
     kept = [(view, T) for view, T in zip(numbered, poses, strict=True) if T is not None]
     bundle = Bundle(lenses, np.zeros((1, 6)), {view.frame: _vector(T) for view, T in kept})
-    done = adjust(bundle, [view for view, _ in kept], board.points, 0)
-    return _camera(name, size, done.bundle.lenses[0], np.eye(4)), [v for v, _ in kept], done.residuals, dropped
+    used = [view for view, _ in kept]
+    used, done = _without_misread_corners([name], used, adjust(bundle, used, board.points, 0), board, 0, dropped)
+    return _camera(name, size, done.bundle.lenses[0], np.eye(4)), used, done.residuals, dropped
 
 
 def first_lenses(
@@ -318,6 +323,27 @@ def _outliers(views: Sequence[View], done: Adjusted) -> set[int]:
     # No camera and no reference may vanish.
     left = Counter(view.camera for i, view in enumerate(views) if i not in worst)
     return {i for i in worst if left[views[i].camera] >= MIN_LENS_VIEWS}
+
+
+def _without_misread_corners(
+    names: Sequence[str], views: list[View], done: Adjusted, board: Board, reference: int, dropped: list[str]
+) -> tuple[list[View], Adjusted]:
+    """The views without single corners that are far off, and the adjustment without them; says which in `dropped`."""
+    cleaned = []
+    for view, residual in zip(views, done.residuals, strict=True):
+        errors = np.linalg.norm(residual, axis=1)
+        good = errors <= max(BAD_VIEW_PX, BAD_CORNER_TIMES * float(np.median(errors)))
+        bad = int((~good).sum())
+        if 0 < bad <= max(1.0, BAD_CORNERS * len(good)):
+            dropped.append(
+                f"{names[view.camera]}, frame {view.frame}: {bad} of {len(good)} corners, {errors.max():.1f} px off: "
+                "misread"
+            )
+            view = replace(view, ids=view.ids[good], places=view.places[good])
+        cleaned.append(view)
+    if all(new is old for new, old in zip(cleaned, views, strict=True)):
+        return views, done
+    return cleaned, adjust(done.bundle, cleaned, board.points, reference)
 
 
 def _dropped(names: Sequence[str], view: View, residual: Array) -> str:

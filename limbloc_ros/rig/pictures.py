@@ -62,18 +62,18 @@ def coverage_picture(
     columns = min(4, len(cameras))
     rows = -(-len(cameras) // columns)
     shape = max(camera.height / camera.width for camera in cameras)
-    figure = Figure(figsize=(3.1 * columns + 0.9, (3.1 * shape + 0.45) * rows + 0.3), layout="constrained")
+    figure = Figure(figsize=(3.1 * columns + 0.9, (3.1 * shape + 0.6) * rows + 0.2), layout="constrained")
     grid = figure.subplots(rows, columns, squeeze=False)
     limit = float(np.percentile(np.concatenate(errors), 98)) if any(map(len, errors)) else 1.0
     dots = None
     for i, (axes, (_, camera)) in enumerate(_placed(grid, {camera.name: camera for camera in cameras})):
         extent = (-0.5, camera.width - 0.5, camera.height - 0.5, -0.5)
-        axes.imshow(np.where(cells[i] > 0, np.nan, 1.0), extent=extent, cmap="Reds", vmin=0, vmax=2.2, aspect="equal")
+        axes.imshow(np.where(cells[i] > 0, np.nan, 1.0), extent=extent, cmap="Reds", vmin=0, vmax=3.5, aspect="equal")
         axes.plot([extent[0], extent[1], extent[1], extent[0], extent[0]],
                   [extent[2], extent[2], extent[3], extent[3], extent[2]], color="#444444", lw=0.8)  # fmt: skip
-        dots = axes.scatter(*places[i].T, c=errors[i], s=3, cmap="viridis", vmin=0, vmax=limit, linewidths=0)
+        dots = axes.scatter(*places[i].T, c=errors[i], s=7, cmap="viridis", vmin=0, vmax=limit, linewidths=0)
         share = 100 * float((cells[i] > 0).mean())
-        axes.set_title(f"{camera.name}: {len(errors[i])} corners, {share:.0f} % of the image", fontsize=9)
+        axes.set_title(f"{camera.name}\n{len(errors[i])} corners, {share:.0f} % of the image", fontsize=9)
     if dots is not None:
         figure.colorbar(dots, ax=grid, label="error px", shrink=0.8, aspect=30)
     return png(figure)
