@@ -124,7 +124,7 @@ def test_an_arm_that_slipped_into_the_trunk_is_found_again(monkeypatch):
     wrist = []
     for checks in (True, False):
         if not checks:
-            monkeypatch.setattr(Tracker, "_limbs_are_due", lambda self, cost: False)
+            monkeypatch.setattr(Tracker, "_check_limbs", lambda self, limbs, result, *others: result)
         follower = Tracker(seed=0)
         follow(follower, 20)
         follower._last = slipped
@@ -151,12 +151,16 @@ def test_a_limb_that_moves_fast_is_not_lost():
 # when a fit is doubted
 
 
+ALL_LIMBS = ["upper_arm_L", "upper_arm_R", "thigh_L", "thigh_R"]
+
+
 class Stand:
     """Stands in for searches and refinements: hands out figures of the costs that it is told, and counts."""
 
     def __init__(self, monkeypatch):
         self.scratch_cost, self.costs = 1e-4, {}
         self.searched, self.refined, self.checked, self.guessed = [], [], [], []
+        self.found = set()
         self.frame = 0
         monkeypatch.setattr(tracker, "fit_from_scratch", self.search)
         monkeypatch.setattr(tracker, "refine", self.refine)
@@ -173,19 +177,21 @@ class Stand:
             FigureState.standing([0.0, 0.0, 1.0]), SimpleNamespace(cost=self.scratch_cost), judged=self.scratch_cost
         )
 
-    def refine(self, state, evidence, weights, iterations, size=None):
+    def refine(self, state, evidence, weights, iterations, size=None, known=None):
         if iterations != Tracker.FINAL_STEPS:
             self.refined.append((self.frame, state, iterations))
         cost = self.costs.get(self.frame, 1e-4)
-        return SimpleNamespace(state=FigureState.standing(state.root), system=SimpleNamespace(cost=cost))
+        settled = FigureState.standing(state.root)
+        return SimpleNamespace(state=settled, system=SimpleNamespace(cost=cost), stop="iterations")
 
     def system(self, state, evidence, weights):
         self.guessed.append((self.frame, state))
         return SimpleNamespace(cost=self.costs.get(self.frame, 1e-4))
 
-    def check(self, result, hull, surface, evidence, size):
-        self.checked.append(self.frame)
-        return result
+    def check(self, limbs, result, hull, surface, evidence, size, settled_m):
+        assert settled_m == (0.0 if len(limbs) == 4 else Tracker.SETTLED_M)
+        self.checked.append((self.frame, [f"{kind.bones[0]}_{side}" for kind, side in limbs]))
+        return SimpleNamespace(**vars(result)) if self.frame in self.found else result
 
     def run(self, follower, frames, centres=None):
         costs = []
@@ -206,19 +212,30 @@ def stand(monkeypatch):
     return Stand(monkeypatch)
 
 
-def test_calm_frames_are_followed_and_limbs_checked_now_and_then(stand):
-    stand.run(Tracker(seed=0), 20)
+def test_calm_frames_are_followed_and_each_limb_checked_now_and_then(stand):
+    stand.run(Tracker(seed=0), 13)
     assert stand.search_frames == [1]
-    assert [frame for frame, *_ in stand.refined] == list(range(2, 21))
-    assert stand.checked == [8, 16]
-    assert Tracker.PATIENCE == 8
+    assert [frame for frame, *_ in stand.refined] == list(range(2, 14))
+    in_turn = ALL_LIMBS + ALL_LIMBS[:2]
+    assert stand.checked == [(frame, [limb]) for frame, limb in zip(range(2, 14, 2), in_turn, strict=True)]
 
 
-def test_limbs_are_checked_at_once_when_the_cost_rises_and_ever_less_often_in_vain(stand):
-    stand.costs = {frame: 1e-4 * 1.4 ** (frame - 2) for frame in range(3, 10)}
-    stand.run(Tracker(seed=0), 9)
-    assert stand.checked == [3, 5, 9]
-    assert stand.search_frames == [1, 9]  # which takes longer and waits longer
+def test_all_limbs_are_checked_at_once_when_the_cost_rises_and_ever_less_often_in_vain(stand, monkeypatch):
+    monkeypatch.setattr(Tracker, "TURN", 99)
+    monkeypatch.setattr(Tracker, "_doubts", lambda self, cost: False)
+    stand.costs = dict.fromkeys(range(3, 9), 2e-4) | {9: 3.9e-4, 10: 3.9e-4} | dict.fromkeys(range(11, 20), 6e-4)
+    stand.run(Tracker(seed=0), 19)
+    # at 9 the wait is over; at 11 it is not, but the cost has risen once more
+    assert stand.checked == [(frame, ALL_LIMBS) for frame in (3, 5, 9, 11, 19)]
+    assert [frame for frame, _, steps in stand.refined if steps == Tracker.MORE_STEPS] == [3, 5, 9, 11, 19]
+
+
+def test_when_a_limb_was_found_elsewhere_the_next_frame_is_asked_as_well(stand, monkeypatch):
+    monkeypatch.setattr(Tracker, "TURN", 99)
+    stand.costs = dict.fromkeys(range(3, 9), 2e-4)
+    stand.found = {5}
+    stand.run(Tracker(seed=0), 8)
+    assert [frame for frame, _ in stand.checked] == [3, 5, 6, 8]
 
 
 def test_what_is_searched_can_be_said(stand):

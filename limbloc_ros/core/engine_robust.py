@@ -169,21 +169,37 @@ class KnownSize:
     shape: Array
     weight: float
 
+    def cost(self, shape: Array) -> float:
+        """What a shape costs, m^2."""
+        deviation = shape - self.shape
+        return self.weight * float(deviation @ deviation)
+
 
 def refine(
-    state: FigureState, evidence: Evidence, weights: Weights, iterations: int, size: KnownSize | None = None
+    state: FigureState,
+    evidence: Evidence,
+    weights: Weights,
+    iterations: int,
+    size: KnownSize | None = None,
+    known: lm.System | None = None,
 ) -> lm.LmResult[FigureState]:
-    """Levenberg-Marquardt on all parameters at once."""
+    """Levenberg-Marquardt on all parameters at once; `known` is `energy.system` of the state, where that is known."""
     step = np.full(3 + figure.N_DOF + len(state.shape), 0.5)
     step[:3] = 0.1
     step[3 + figure.N_DOF] = 0.1
     step[4 + figure.N_DOF :] = 1.0
 
-    def evaluate(s: FigureState) -> lm.System:
-        system = energy.system(s, evidence, weights)
+    def sized(system: lm.System, s: FigureState) -> lm.System:
         return system if size is None else _sized(system, s.shape, size)
 
-    return lm.minimise(evaluate, lambda s, delta: s.moved(delta), state, iterations=iterations, largest_step=step)
+    return lm.minimise(
+        lambda s: sized(energy.system(s, evidence, weights), s),
+        lambda s, delta: s.moved(delta),
+        state,
+        iterations=iterations,
+        largest_step=step,
+        known=None if known is None else sized(known, state),
+    )
 
 
 def _sized(system: lm.System, shape: Array, size: KnownSize) -> lm.System:
@@ -192,7 +208,7 @@ def _sized(system: lm.System, shape: Array, size: KnownSize) -> lm.System:
     rows = np.arange(len(gradient) - len(shape), len(gradient))
     gradient[rows] += size.weight * deviation
     matrix[rows, rows] += size.weight
-    return lm.System(system.cost + size.weight * float(deviation @ deviation), gradient, matrix)
+    return lm.System(system.cost + size.cost(shape), gradient, matrix)
 
 
 @dataclass(frozen=True)

@@ -55,6 +55,7 @@ def minimise(
     tolerance: float = 1e-3,
     damping: float = 1e-2,
     largest_step: Array | None = None,
+    known: System | None = None,
 ) -> LmResult[State]:
     """Minimise a sum of (robust) squares.
 
@@ -68,8 +69,9 @@ def minimise(
         tolerance: stop when an accepted step lowers the cost by less than this fraction.
         damping: first weight of Marquardt's diagonal.
         largest_step: [P] no component may exceed it; the step is shortened as a whole.
+        known: the system at `start`, if it has been evaluated.
     """
-    state, system = start, evaluate(start)
+    state, system = start, evaluate(start) if known is None else known
     stop = "iterations"
     count = 0
     while count < iterations:

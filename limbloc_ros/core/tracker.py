@@ -26,11 +26,13 @@ from limbloc_ros.core.engine_robust import (
 )
 from limbloc_ros.core.figure import BONE, FigureState, place
 from limbloc_ros.core.hull import Hull
-from limbloc_ros.core.search import ARM, LEG, Medial
+from limbloc_ros.core.search import ARM, LEG, LimbKind, Medial
 from limbloc_ros.core.surface import Surface
 
 Array = NDArray[np.float64]
+Result = lm.LmResult[FigureState]
 
+LIMBS = [(kind, side) for kind in (ARM, LEG) for side in "LR"]
 
 #: Bones whose turn goes on from frame to frame; how hands and feet turn is seen too badly to go by.
 SWINGING = np.array(
@@ -44,7 +46,7 @@ class Tracker:
     #: A cost this much above the usual one, or above this many m^2, is no longer believed ...
     DOUBT, DOUBTFUL_COST = 1.35, 4.5e-4
     #: ... but starting anew, which takes as long as many followed frames, is tried only every so many frames: in a
-    #: live room a slow fit makes the next step longer. Limbs are checked as often. Each time that starting anew finds
+    #: live room a slow fit makes the next step longer. Each time that starting anew finds
     #: nothing better, the wait doubles, up to this: some hulls are just bad. Only after a hopeless start the next
     #: frame is tried.
     PATIENCE, LONGEST_WAIT = 8, 32
@@ -56,12 +58,15 @@ class Tracker:
             rounds=1, shown=False,
         ),
     )  # fmt: skip
-    #: Limbs are checked at once when the cost is so much above the usual one (in vain, the wait doubles); other places
-    #: that are tried for each; by how much of the energy it and what the
-    #: silhouettes add must be lower there.
-    LIMB_DOUBT, ARM_PLACES, LEG_PLACES, LIMB_GAIN = 1.25, 1, 1, 0.03
-    #: A limb that all its joints have so near to where it is stays there.
-    SAME_PLACE_M = 0.05
+    #: Every so many frames one of the limbs has its turn to be looked for elsewhere, in so many places; by how much of
+    #: the energy it and what the silhouettes add must be lower there.
+    TURN, PLACES, LIMB_GAIN = 2, 1, 0.03
+    #: When the cost is so much above the usual one, the figure is first carried on by so many steps, and then all limbs
+    #: are checked at once; each time in vain, the wait doubles, up to this, unless the cost rises as much once more.
+    LIMB_DOUBT, MORE_STEPS, LONGEST_DOUBT = 1.25, 10, 8
+    #: A limb that all its joints have so near to where it is stays there; so does one that settles so near, but when the
+    #: cost is high: then it may have come back along a better way.
+    SAME_PLACE_M, SETTLED_M = 0.05, 0.03
     #: The figure is carried along with the firm weights of the search, which lead from further off; so many more steps
     #: with the final ones put its joints in their places.
     FINAL_STEPS = 6
@@ -80,7 +85,8 @@ class Tracker:
         """Forget the last frame."""
         self._last: FigureState | None = None
         self._before: FigureState | None = None
-        self._next_check, self._next_doubt, self._doubt_wait = self.PATIENCE, 0, 1
+        self._next_check, self._turn = self.TURN, 0
+        self._next_doubt, self._doubt_wait, self._vain_cost = 0, 1, 0.0
         self._usual_cost = 0.0
         self._frame = 0
         self._last_scratch = -self.PATIENCE
@@ -104,16 +110,13 @@ class Tracker:
         if self._last is not None:
             evidence = gather_evidence(hull, surface, self.POINTS, np.random.default_rng(self._seed))
             guesses = self._guesses(self._last, moved)
-            costs = [energy.system(guess, evidence, self._firm).cost for guess in guesses]
-            start = guesses[int(np.argmin(costs))]
+            systems = [energy.system(guess, evidence, self._firm) for guess in guesses]
+            best = min(range(len(guesses)), key=lambda n: systems[n].cost)
             size = KnownSize(self._size, self.SIZE_WEIGHT * min(self._sized, self.REMEMBERED))
-            result = refine(start, evidence, self._firm, 8 if np.abs(moved).max() < 0.1 else 20, size)
-            if self._limbs_are_due(result.system.cost):
-                checked = self._check_limbs(result, hull, surface, evidence, size)
-                self._doubt_wait = 1 if checked is not result else min(2 * self._doubt_wait, self.PATIENCE)
-                self._next_doubt, self._next_check = self._frame + self._doubt_wait, self._frame + self.PATIENCE
-                result = checked
-            judged = energy.system(result.state, evidence, self._firm).cost
+            steps = 8 if np.abs(moved).max() < 0.1 else 20
+            result = refine(guesses[best], evidence, self._firm, steps, size, systems[best])
+            result = self._with_limbs_checked(result, hull, surface, evidence, size)
+            judged = result.system.cost - size.cost(result.state.shape)
             final = refine(result.state, evidence, self._weights, self.FINAL_STEPS, size)
             self._remember(final.state.shape)
             fit = Fit(final.state, final.system, judged=judged)
@@ -159,26 +162,58 @@ class Tracker:
         waited = self._frame - self._last_scratch >= self._wait
         return waited and (cost > self.DOUBT * self._usual_cost or cost > self.DOUBTFUL_COST)
 
-    def _limbs_are_due(self, cost: float) -> bool:
-        if self._frame >= self._next_check:
-            return True
-        return self._frame >= self._next_doubt and cost > self.LIMB_DOUBT * self._usual_cost
+    def _with_limbs_checked(
+        self, result: Result, hull: Hull, surface: Surface, evidence: Evidence, size: KnownSize
+    ) -> Result:
+        """A limb that moved too fast, or has slipped into the trunk, stays behind: look for it elsewhere."""
+        bearable = min(self.LIMB_DOUBT * self._usual_cost, self.DOUBTFUL_COST)
+        if self._frame < self._next_doubt:
+            bearable = max(bearable, self.LIMB_DOUBT * self._vain_cost)
+        hasty = result.system.cost > bearable
+        if hasty:
+            if result.stop == "iterations":
+                result = refine(result.state, evidence, self._firm, self.MORE_STEPS, size)
+            limbs = LIMBS
+        elif self._frame >= self._next_check:
+            limbs = LIMBS[self._turn : self._turn + 1]
+            self._turn = (self._turn + 1) % len(LIMBS)
+        else:
+            return result
+        checked = self._check_limbs(limbs, result, hull, surface, evidence, size, 0.0 if hasty else self.SETTLED_M)
+        self._next_check = self._frame + self.TURN
+        if checked is not result:
+            self._doubt_wait, self._next_doubt = 1, self._frame + 1
+        elif hasty:
+            self._vain_cost, self._doubt_wait = result.system.cost, min(2 * self._doubt_wait, self.LONGEST_DOUBT)
+            self._next_doubt = self._frame + self._doubt_wait
+        return checked
 
     def _check_limbs(
-        self, result: lm.LmResult[FigureState], hull: Hull, surface: Surface, evidence: Evidence, size: KnownSize
-    ) -> lm.LmResult[FigureState]:
-        """A limb that moved too fast, or has slipped into the trunk, stays behind: look for each elsewhere."""
+        self,
+        limbs: Sequence[tuple[LimbKind, str]],
+        result: Result,
+        hull: Hull,
+        surface: Surface,
+        evidence: Evidence,
+        size: KnownSize,
+        settled_m: float,
+    ) -> Result:
+        """The figure, or it with one of these limbs after the other elsewhere, but for those that settle near it."""
         scene = make_scene(hull, Medial.of(hull), surface, self._seed, self._weights, QUICK)
-        for kind, places in ((ARM, self.ARM_PLACES), (LEG, self.LEG_PLACES)):
-            for side in "LR":
-                for state in with_one_limb(result.state, scene, kind, side, places, QUICK.candidates):
-                    away = place(state).joints - place(result.state).joints
-                    if np.linalg.norm(away, axis=1).max() < self.SAME_PLACE_M:
-                        continue
-                    settled = refine(state, scene.quick, scene.lenient, 5, size).state
-                    other = refine(settled, evidence, self._firm, 8, size)
-                    gain = result.system.cost - other.system.cost
-                    gain += unseen(result.state, hull) - unseen(other.state, hull)
-                    if gain > self.LIMB_GAIN * result.system.cost:
-                        result = other
+        for kind, side in limbs:
+            for state in with_one_limb(result.state, scene, kind, side, self.PLACES, QUICK.candidates):
+                if _apart_m(state, result.state) < self.SAME_PLACE_M:
+                    continue
+                settled = refine(state, scene.quick, scene.lenient, 5, size).state
+                if _apart_m(settled, result.state) < settled_m:
+                    continue
+                other = refine(settled, evidence, self._firm, 8, size)
+                gain = result.system.cost - other.system.cost
+                gain += unseen(result.state, hull) - unseen(other.state, hull)
+                if gain > self.LIMB_GAIN * result.system.cost:
+                    result = other
         return result
+
+
+def _apart_m(a: FigureState, b: FigureState) -> float:
+    return float(np.linalg.norm(place(a).joints - place(b).joints, axis=1).max())
