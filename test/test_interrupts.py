@@ -6,6 +6,7 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -73,3 +74,32 @@ def test_whatever_a_compiler_calls_back_comes_to_its_end(module):
         assert ended == [True]
     finally:
         signal.signal(signal.SIGUSR1, before)
+
+
+# What is called back in the middle of loading can lose an exception.
+LOSING = """
+import signal, sys
+from limbloc_ros import cli
+from limbloc_ros.recordings import offline
+
+def prepare(say=None):
+    try:
+        signal.raise_signal(signal.SIGINT)
+    except KeyboardInterrupt:
+        pass
+
+offline.prepare = prepare
+sys.exit(cli.main(sys.argv[1:]))
+"""
+
+
+@pytest.mark.parametrize("command", ["process", "batch"])
+def test_ctrl_c_while_the_command_line_loads_kernels_is_never_lost(command, tmp_path):
+    case = Path(__file__).parent / "data" / "benchmark" / "public" / "seq_wave"
+    words = [command, str(case), "--jobs", "1", "--out", str(tmp_path / "out")]
+    done = subprocess.run(
+        [sys.executable, "-c", LOSING, *words], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == interrupts.EXIT_CODE
+    assert f"\nlimbloc {command}: interrupted before the first frame" in done.stderr
+    assert not (tmp_path / "out").exists()

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from limbloc_ros import __version__
+from limbloc_ros.core import interrupts
 from limbloc_ros.core.camera import Rig
 from limbloc_ros.core.errors import ConfigError, InputError, Interrupted, LimblocError
 from limbloc_ros.recordings import offline
@@ -77,7 +78,8 @@ def do(task: Task, jobs: int = 1) -> Outcome:
                     "remove it"
                 )
             return _outcome(task, run, done_before=True)
-        offline.prepare()
+        with interrupts.ending_at_once(f"limbloc batch: interrupted before the first frame of {task.recording}"):
+            offline.prepare()
         partial, kept = task.out / ".partial", KeptFrames()
         run = offline.process(source, task.config, partial=partial, jobs=jobs, leave_out=task.leave_out, kept=kept)
         save_folder(run, source.rig, kept, task.out)
