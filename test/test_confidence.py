@@ -12,7 +12,9 @@ from limbloc_ros.core.figure import FigureState, place
 from limbloc_ros.core.hull import Hull
 
 BODY = place(FigureState.standing(np.array([0.0, 0.0, 0.95]))).flesh()
-SHOWN = np.array([[0.1, 0.1, 0.35], [0.1, 0.1, 0.35]])
+SHOWN = np.array([[0.16, 0.26, 0.65], [0.16, 0.26, 0.65]])
+FAINT = SHOWN * [[1.0, 1.0, 1.0], [0.3, 0.3, 1.0]]  # the right arm
+ARM_HIDDEN = "arm hardly shows in the silhouettes"
 
 
 @pytest.fixture(autouse=True)
@@ -38,7 +40,7 @@ def asked(passed_m: float = 0.04, shown=SHOWN, energy: float = 0.3, hull: Hull |
 
 def test_nothing_is_doubted_without_a_sign():
     assert asked() == ""
-    assert risk_of(block(), BODY, 0.3, None, 0.2) == (0.0, "")
+    assert risk_of(block(), BODY, 0.3, None, 0.1) == (0.0, "")
 
 
 @pytest.mark.parametrize("side", ["left", "right"])
@@ -52,28 +54,30 @@ def test_an_arm_that_hardly_shows_is_named(side):
 @pytest.mark.parametrize("side", ["left", "right"])
 def test_a_leg_that_hardly_shows_is_named(side):
     shown = SHOWN.copy()
-    shown[["left", "right"].index(side), 2] = 0.02
+    shown[["left", "right"].index(side), 2] = 0.002
     assert asked(shown=shown) == f"the {side} leg hardly shows in the silhouettes"
 
 
 def test_what_the_figure_has_not_is_told_with_its_distance():
-    assert "something 20 cm beside the figure" in asked(passed_m=0.2)
+    assert "something 18 cm beside the figure" in asked(passed_m=0.18)
+    assert asked(passed_m=0.17) == ""
+    assert "something 17 cm beside the figure" in asked(passed_m=0.17, shown=0.4 * SHOWN)
+    assert risk_of(block(), BODY, 0.3, None, 0.2)[0] == 1.0
 
 
 def test_each_sign_makes_a_pose_less_likely_right():
     """Where one sign alone is not enough, two are."""
-    faint = SHOWN * [[1.0, 1.0, 1.0], [0.6, 0.6, 1.0]]
-    assert asked(shown=faint) == "" and asked(passed_m=0.10) == ""
-    assert asked(shown=faint, passed_m=0.10)
+    assert asked(shown=FAINT) == "" and asked(passed_m=0.14) == ""
+    assert asked(shown=FAINT, passed_m=0.14)
 
 
 def test_a_forearm_in_other_flesh_is_a_sign(depths):
-    faint = SHOWN * [[1.0, 1.0, 1.0], [0.6, 0.6, 1.0]]
-    assert asked(shown=faint) == ""
+    assert asked(shown=FAINT, passed_m=0.09) == ""
     depths[1] = 0.08
-    assert asked(shown=faint) == "the right forearm lies close to other parts"
+    assert asked(shown=FAINT, passed_m=0.09) == f"the right {ARM_HIDDEN}"
+    assert risk_of(block(), BODY, 0.3, SHOWN, 0.04)[1] == "the right forearm lies close to other parts"
     depths[:] = 0.08, -0.17
-    assert asked(shown=faint) == "the left forearm lies close to other parts"
+    assert risk_of(block(), BODY, 0.3, SHOWN, 0.04)[1] == "the left forearm lies close to other parts"
 
 
 def test_a_figure_of_no_such_hull_and_half_a_person():

@@ -90,6 +90,24 @@ def test_a_limb_is_asked_as_the_whole_figure_is():
     assert share.sum() == pytest.approx(weights.sum(), rel=0.1)
 
 
+def test_what_only_one_group_of_parts_covers():
+    """Against the silhouettes that the figure leaves open without it, whatever the order of the parts."""
+    centres = np.array([[0.0, 0.0, 1.0], [0.3, 0.0, 1.0], [0.6, 0.1, 1.1], [0.3, 0.0, 1.6]])
+    radii = np.array([0.25, 0.1, 0.08, 0.1])
+    views = views_of(((0.0, 0.0, 1.0), 0.25), ((0.35, 0.0, 1.0), 0.12))
+    parts = np.array([[1, 2, 2], [0, 0, 0], [3, 3, 3], [1, 1, 1]])  # the third is seen where there is nothing
+    groups = np.array([1, 0, 2, 1])
+    alone, mismatch = views.shares(parts, groups, centres, radii)
+    assert mismatch == pytest.approx(views.mismatch(parts, centres, radii), abs=1e-12)
+    for group in range(3):
+        others = views.drawn(parts[groups != group], centres, radii)
+        this = views.drawn(parts[groups == group], centres, radii)
+        only = (this != 0) & (others == 0) & (views.cells == kernels.SEEN)
+        cells = np.add.reduceat(only, views.frames[:, 5])
+        assert alone[group] == pytest.approx(views.worth @ cells, abs=1e-12)
+    assert alone[0] > alone[1] > 0.05 > alone[2] == 0.0
+
+
 def test_nobody_is_asked_about_others():
     views = views_of(((-0.35, 0.0, 1.0), 0.25), ((0.35, 0.1, 1.0), 0.25))
     first, second = np.array([[-0.35, 0.0, 1.0]]), np.array([[0.35, 0.1, 1.0]])
@@ -136,7 +154,7 @@ def test_discs_between_two_rows_cover_nothing():
     discs = np.array([[3.0, 4.0 - 2e-8, 1e-8], [3.0, 4.0 + 2e-8, 1e-8], [3.3, 4.3, 0.1]])
     span, drawn = np.empty((8, 2)), np.zeros(64, np.int16)
     parts = np.array([[0, 1, 1], [2, 2, 2]])
-    assert kernels.draw_parts(parts, discs, frames[0], span, cells, drawn, 1) == (0, 0)
+    assert kernels.draw_parts(parts, discs, frames[0], span, cells, drawn, 1, False) == (0, 0)
     assert not drawn.any()
 
 

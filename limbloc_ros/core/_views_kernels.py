@@ -104,13 +104,15 @@ def see_balls(centres: Any, radii: Any, cams: Any, c: int, frame: Any, discs: An
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
-def draw_parts(parts: Any, discs: Any, frame: Any, span: Any, cells: Any, drawn: Any, mark: int) -> tuple[int, int]:
+def draw_parts(
+    parts: Any, discs: Any, frame: Any, span: Any, cells: Any, drawn: Any, mark: int, alone: bool
+) -> tuple[int, int]:
     """Write `mark` to the cells of one camera whose centres the parts cover, but where `drawn` is BODY.
 
-    A part is the convex hull of three balls; here that of the three discs that the balls are seen as, row by row: its
+    Another mark that is there already is replaced, or with `alone` both give way to BODY. A part is the convex hull of three balls; here that of the three discs that the balls are seen as, row by row: its
     outermost points there lie on a disc or on an outer tangent of two.
 
-    Returns how many of the newly marked cells are foreground, and background.
+    Returns how many of the cells that get this mark are foreground, and background.
     """
     _, _, width, height, _, offset = frame
     seen, bare = 0, 0
@@ -143,6 +145,9 @@ def draw_parts(parts: Any, discs: Any, frame: Any, span: Any, cells: Any, drawn:
             end = math.floor(min(span[row, 1], width - 1.0))
             for at in range(offset + row * width + begin, offset + row * width + end + 1):
                 if drawn[at] != mark and drawn[at] != BODY:
+                    if alone and drawn[at] != 0:
+                        drawn[at] = BODY
+                        continue
                     drawn[at] = mark
                     if cells[at] == BARE:
                         bare += 1
@@ -162,7 +167,33 @@ def draw(parts: Any, centres: Any, radii: Any, cams: Any, frames: Any, cells: An
     counts = np.empty((len(frames), 2), np.int64)
     for c in range(len(frames)):
         see_balls(centres, radii, cams, c, frames[c], discs)
-        counts[c, 0], counts[c, 1] = draw_parts(parts, discs, frames[c], span, cells, drawn, BODY)
+        counts[c, 0], counts[c, 1] = draw_parts(parts, discs, frames[c], span, cells, drawn, BODY, False)
+    return counts
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def draw_groups(
+    parts: Any, groups: Any, count: int, centres: Any, radii: Any, cams: Any, frames: Any, cells: Any
+) -> Any:
+    """Foreground cells that no group of parts but one covers, in every camera, then those that any covers, and cells of
+    background that any covers: int64 [C, count + 2].
+
+    `groups` [P] says to which each part belongs, 0 to count - 1.
+    """
+    discs = np.empty((len(centres), 3))
+    span = np.empty((max(1, frames[:, 3].max()), 2))
+    drawn = np.zeros(len(cells), np.int16)
+    counts = np.zeros((len(frames), count + 2), np.int64)
+    for c in range(len(frames)):
+        see_balls(centres, radii, cams, c, frames[c], discs)
+        for p in range(len(parts)):
+            seen, bare = draw_parts(parts[p : p + 1], discs, frames[c], span, cells, drawn, groups[p] + 1, True)
+            counts[c, count] += seen
+            counts[c, count + 1] += bare
+        begin = frames[c, 5]
+        for at in range(begin, begin + frames[c, 2] * frames[c, 3]):
+            if drawn[at] > 0 and cells[at] == SEEN:
+                counts[c, drawn[at] - 1] += 1
     return counts
 
 
@@ -200,6 +231,6 @@ def draw_limbs(
             for n in range(len(limbs)):
                 for i in range(3):
                     discs[limbs[n], i] = moved[n, i]
-            _, bare[c, m] = draw_parts(parts, discs, frames[c], span, cells, drawn, m + 1)
+            _, bare[c, m] = draw_parts(parts, discs, frames[c], span, cells, drawn, m + 1, False)
             for n in range(begin, q):
                 covers[m, n] = drawn[asked[n]] == m + 1

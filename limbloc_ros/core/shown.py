@@ -3,8 +3,8 @@
 
 An arm that shows nowhere may as well be elsewhere: before the trunk, in its flesh, or where a ragged mask has lost it,
 it hardly changes how well a figure matches its hull. A leg that the hull has lost is folded into the other flesh. So it
-is asked what the cameras see of each limb that they see of nothing else, and that is held against what figure and hull
-do not share there: the noise of the masks, clothes, and limbs in wrong places.
+is asked what the cameras see of each limb that they see of nothing else, and that is held against what figure and
+silhouettes do not share: the noise of the masks, clothes, and limbs in wrong places.
 """
 
 from __future__ import annotations
@@ -13,18 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from limbloc_ros.core._part_kernels import flesh_distance
-from limbloc_ros.core._shown_kernels import compare_silhouettes
 from limbloc_ros.core.figure import PART_NAMES, PART_SPHERES, SPHERE
-from limbloc_ros.core.hull import Hull
 from limbloc_ros.core.pose import Flesh
-from limbloc_ros.core.surface import Surface
+from limbloc_ros.core.views import Views
 
 Array = NDArray[np.float64]
 
-#: The silhouettes' cells are no finer than this, m, nor than the hull's voxels.
-CELL_M = 0.02
-#: A figure is looked at so far beyond the hull's silhouettes, m.
-MARGIN_M = 0.3
+#: A figure that shares all but this with the silhouettes could not share more: cells are cells.
+LEAST_MISMATCH = 1e-3
 
 SIDES = ("left", "right")
 _REST = 0
@@ -33,7 +29,6 @@ _GROUPS = {
     "upper_arm_R": 4, "forearm_R": 5, "hand_R": 5, "shin_R": 6, "foot_R": 6,
 }  # fmt: skip
 _GROUP_OF_PART = np.array([_GROUPS.get(name, _REST) for name in PART_NAMES])
-_COUNT = 7
 _GIRDLES = ("girdle_L", "girdle_R")
 _FOREARMS = np.array([[SPHERE[f"{name}_{side}"] for name in ("bulge", "wrist")] for side in "LR"])
 #: All parts but one arm and the girdles, which hold the shoulders on.
@@ -43,26 +38,20 @@ _BUT_THIS_ARM = [
 ]
 
 
-def limbs_shown(hull: Hull, surface: Surface, flesh: Flesh) -> Array | None:
+def limbs_shown(views: Views, flesh: Flesh) -> Array:
     """What only the limbs explain of the silhouettes.
 
     Args:
-        hull, surface: what the figure was fitted to.
+        views: what the cameras saw.
         flesh: of the figure.
 
     Returns:
-        [2, 3] of the left and the right side (SIDES), the area of the hull's silhouettes that only the upper arm
-        covers, that only forearm and hand do, and that only shin and foot do, summed over all cameras, over the area
-        that figure and hull do not share: usually 0.1, 0.1 and 0.35. None where nobody knows where the cameras are.
+        [2, 3] of the left and the right side (SIDES), the area of the silhouettes that only the upper arm covers, that
+        only forearm and hand do, and that only shin and foot do, over the area that figure and silhouettes do not
+        share; mean of the cameras, as `Views.mismatch` weighs them. Usually 0.15, 0.25 and 0.65.
     """
-    if len(hull.viewpoints) == 0:
-        return None
-    cell = max(CELL_M, hull.voxel_m)
-    cells = compare_silhouettes(
-        surface.points, np.array(hull.viewpoints, np.float64), PART_SPHERES, _GROUP_OF_PART, flesh.centres, flesh.radii,
-        _COUNT, cell, round(MARGIN_M / cell),
-    )  # fmt: skip
-    return np.asarray(cells[1:_COUNT].reshape(2, 3) / max(int(cells[_COUNT]), 1))
+    alone, mismatch = views.shares(PART_SPHERES, _GROUP_OF_PART, flesh.centres, flesh.radii)
+    return np.asarray(alone[1:].reshape(2, 3) / max(mismatch, LEAST_MISMATCH))
 
 
 def forearm_depths_m(flesh: Flesh) -> Array:

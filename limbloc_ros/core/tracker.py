@@ -64,7 +64,7 @@ class Tracker:
     #: When the cost is so much above the usual one, the figure is first carried on by so many steps, and then all limbs
     #: are checked at once; each time in vain, the wait doubles, up to this, unless the cost rises as much once more.
     LIMB_DOUBT, MORE_STEPS, LONGEST_DOUBT = 1.25, 10, 8
-    #: A limb that all its joints have so near to where it is stays there; so does one that settles so near, but when the
+    #: A limb that all its joints have so near to where it is stays there; so does one that settles so near, unless the
     #: cost is high: then it may have come back along a better way.
     SAME_PLACE_M, SETTLED_M = 0.05, 0.03
     #: The figure is carried along with the firm weights of the search, which lead from further off; so many more steps

@@ -181,6 +181,19 @@ class Views:
         _, counts = self._draw(parts, centres, radii)
         return float(self.worth @ (self.sizes - counts[:, 0] + counts[:, 1]))
 
+    def shares(
+        self, parts: NDArray[np.int64], groups: NDArray[np.int64], centres: Array, radii: Array
+    ) -> tuple[Array, float]:
+        """What each group of parts (`groups` [P], from 0 on) alone covers of the silhouettes, and the `mismatch`.
+
+        Returns:
+            [G] area over that of the silhouettes, mean of the cameras as in the mismatch; and that.
+        """
+        count = int(groups.max()) + 1
+        counts = kernels.draw_groups(parts, groups, count, centres, radii, self.cameras, self.frames, self.cells)
+        mismatch = self.sizes - counts[:, count] + counts[:, count + 1]
+        return np.asarray(self.worth @ counts[:, :count]), float(self.worth @ mismatch)
+
     @cached_property
     def sizes(self) -> NDArray[np.int64]:
         """[C] cells of each silhouette."""
