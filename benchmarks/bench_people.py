@@ -50,6 +50,9 @@ INSIDE_M = 1.25
 #: A live graph in which nobody is found after so long is scored all the same, s.
 LONGEST_WAIT_S = 120.0
 
+#: So many images of each camera show the empty room: the background is learnt from 15.
+EMPTY_IMAGES = 20
+
 #: Name, people, what they do, whether a chair is put beside them and moved.
 SCENES = (
     ("one person", 1, "apart", False),
@@ -166,6 +169,7 @@ def score_live(people: int, together: str, args: argparse.Namespace) -> tuple[Sc
             f"simulated_cameras.rate_hz={float(args.live_rate)}", f"simulated_cameras.number_of_cameras={args.cameras}",
             f"simulated_cameras.width={args.live_width}", f"simulated_cameras.height={args.live_width * 3 // 4}",
             f"simulated_cameras.people={people}", f"simulated_cameras.together={together}",
+            f"simulated_cameras.empty_s={EMPTY_IMAGES / args.live_rate}",
             "pose.fit.temporal=true", f"network.domain_id={1 + os.getpid() % 100}",
         ],
     )  # fmt: skip
