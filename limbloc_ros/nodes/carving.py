@@ -25,7 +25,7 @@ from limbloc_ros.ros import cloud_messages, image_messages, node_main, topics
 from limbloc_ros.ros.backlog import Backlog
 from limbloc_ros.ros.carving_report import CarvingReport
 from limbloc_ros.ros.health import Health
-from limbloc_ros.ros.messages import make_header, stamp_ns
+from limbloc_ros.ros.messages import make_header, message_to_joints, stamp_ns
 from limbloc_ros.ros.parameters import NodeParameters
 from limbloc_ros.ros.rig_source import RigFromTopics, rig_from_file
 
@@ -90,7 +90,7 @@ class CarvingNode(Node):
             self.create_subscription(kind, topic, self.make_callback(name), topics.WORK_QOS)
         self.create_subscription(Header, topics.FRAMES_SKIPPED, self.on_skipped, topics.STREAM_QOS)
         # A pose node that died cannot say so; whose hulls are not answered can.
-        self.create_subscription(PoseArray, topics.JOINTS, lambda _: self.report.answered(), topics.STREAM_QOS)
+        self.create_subscription(PoseArray, topics.JOINTS, self.on_joints, topics.STREAM_QOS)
         self.create_timer(TICK_S, self.on_tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def mask_topic(self, camera: str) -> str:
@@ -127,7 +127,7 @@ class CarvingNode(Node):
                     f"{mask.shape[1]}x{mask.shape[0]}; is the stream scaled, or the rig another camera's?"
                 )
             stamp = stamp_ns(msg.header)
-            self.report.mask(camera, mask, self.health.latency_s(stamp))
+            self.report.mask(camera, mask, stamp, self.health.latency_s(stamp))
             self.put_by(self.synchroniser.add(camera, stamp, mask, time.monotonic_ns()))
 
     def on_tick(self) -> None:
@@ -137,6 +137,11 @@ class CarvingNode(Node):
             timeout_s = self.sync_config.timeout_s
             self.synchroniser.timeout_s = max(timeout_s, BEHIND_TIMEOUT_S) if behind else timeout_s
             self.put_by(self.synchroniser.tick(time.monotonic_ns()))
+
+    def on_joints(self, msg: PoseArray) -> None:
+        """A hull was answered; who moves tells what the cameras' skew costs."""
+        with self.health.guard("joints"):
+            self.report.answered(stamp_ns(msg.header), message_to_joints(msg))
 
     def on_skipped(self, msg: Header) -> None:
         """A camera's segmentation is behind and skipped its images up to this stamp, and so do the others."""

@@ -23,6 +23,7 @@ from limbloc_ros.rig.watch import ConsistencyWatch
 from limbloc_ros.ros.backlog import Backlog
 from limbloc_ros.ros.health import SILENT_S, WINDOW_S, Meter
 from limbloc_ros.ros.messages import ERROR, OK, WARN, make_status
+from limbloc_ros.ros.stamp_skew import Array, StampSkew
 from limbloc_ros.ros.topics import JOINTS
 
 #: A camera that is missing in a larger share of the last seconds' sets is named, with what is known of the cause.
@@ -57,24 +58,31 @@ class CarvingReport:
         self._past: deque[tuple[float, SyncCounters]] = deque()
         self._missing: deque[tuple[float, tuple[str, ...]]] = deque()
         self._jumps, self._jumped_s = 0, -WINDOW_S
+        self._skew = StampSkew()
         self._asked_s: float | None = None
         self.answered_once = False
 
-    def mask(self, camera: str, mask: Pixels, latency_s: float) -> None:
+    def mask(self, camera: str, mask: Pixels, stamp_ns: int, latency_s: float) -> None:
         """A usable mask came."""
         self._masks[camera].tick(latency_s)
+        self._skew.mask(camera, stamp_ns)
         self._fill[camera] = 100.0 * cv2.countNonZero(mask) / mask.size
 
     def carved(self, frames: FrameSet[Pixels], outcome: Hull | NoPerson, carve_ms: float, latency_s: float) -> None:
         """A set was carved and its hull published."""
         self._last, self._outcome, self._carve_ms = frames, outcome, carve_ms
         self._sets.tick(latency_s)
+        self._skew.carved(frames.stamp_ns, frames.skew_ns)
         self._missing.append((time.monotonic(), frames.missing))
         self._asked_s = self._asked_s or time.monotonic()
 
-    def answered(self) -> None:
-        """The pose node answered a hull: with a pose, or with none."""
+    def answered(self, stamp_ns: int, joints: Array | None) -> None:
+        """The pose node answered a hull: with a pose (joints [J, 3] m), or with none."""
         self._asked_s, self.answered_once = None, True
+        if joints is None:
+            self._skew.nobody()
+        else:
+            self._skew.joints(stamp_ns, joints)
 
     def statuses(
         self,
@@ -133,6 +141,8 @@ class CarvingReport:
             message = f"no person: {self._outcome.reason}"
         elif self._outcome is not None:
             voxels, used = self._outcome.inside_count, self._outcome.cameras
+            if said := self._skew.in_words():
+                message = f"carving; {said}"
             if self._outcome.cut_area_m2 > CUT_M2:
                 level, message = WARN, "somebody stands half outside of the carve volume (volume in the rig file)"
         if time.monotonic() - self._jumped_s < WINDOW_S:
@@ -159,7 +169,9 @@ class CarvingReport:
             "voxels_inside": voxels,
             "carve_ms": self._carve_ms,
             "cameras_used": " ".join(used),
-            "skew_ms": self._last.skew_ns / 1e6 if self._last else float("nan"),
+            "skew_ms": self._skew.skew_ms,
+            "fastest_joint_m_s": self._skew.speed_m_s,
+            "skew_costs_mm": self._skew.costs_mm,
             "sets_complete": counters.complete,
             "sets_incomplete": counters.incomplete,
             "sets_dropped": counters.dropped,
@@ -188,6 +200,7 @@ class CarvingReport:
             "rate_hz": meter.rate_hz,
             "latency_ms": meter.latency_ms,
             "mask_fill_percent": self._fill[camera],
+            "stamp_behind_ms": self._skew.behind_ms().get(camera, float("nan")),
             "received": counters.received.get(camera, 0),
             "missing": counters.missing.get(camera, 0),
             "late": counters.late.get(camera, 0),
