@@ -13,14 +13,17 @@ import sys
 import types
 import xml.etree.ElementTree as ET
 from dataclasses import fields
+from importlib import import_module
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import limbloc_ros
+from limbloc_ros.core.config import from_mapping
 from limbloc_ros.nodes import smart_space
 from limbloc_ros.nodes.composed import KINDS, flatten
-from limbloc_ros.nodes.graph_plan import NODE_SECTIONS, SmartSpaceConfig, plan_graph
+from limbloc_ros.nodes.graph_plan import NODE_SECTIONS, SmartSpaceConfig, load_config, plan_graph
 from limbloc_ros.rig.rig_file import load_rig
 from limbloc_ros.ros.environment import graph_environment, share_folder
 from limbloc_ros.ros.supervisor import REFUSED
@@ -102,7 +105,7 @@ def test_the_launch_file_starts_what_the_command_line_starts(launched, given, wo
     """Every option of `smart_space`, and each process with its keys; `limbloc run` has the same."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("ROS_SECURITY_ENCLAVE_OVERRIDE", raising=False)
-    (tmp_path / "lab.yaml").write_bytes((CONFIG / "rig_example.yaml").read_bytes())
+    (tmp_path / "lab.yaml").write_bytes((CONFIG / "rig_4_cameras.yaml").read_bytes())
     (tmp_path / "room.yaml").write_bytes((CONFIG / "smart_space.yaml").read_bytes())
     parser = argparse.ArgumentParser()
     smart_space.add_arguments(parser)
@@ -162,40 +165,47 @@ def test_the_executable_that_it_starts_is_installed():
 
 def test_the_launch_file_and_config_are_found_where_they_are():
     assert share_folder() == ROOT
-    for name in ("smart_space.yaml", "fastdds.xml", "fastdds_localhost.xml", "limbloc.rviz", "rig_example.yaml"):
+    for name in ("smart_space.yaml", "fastdds.xml", "fastdds_localhost.xml", "limbloc.rviz", "rig_4_cameras.yaml"):
         assert (CONFIG / name).is_file()
 
 
-def test_every_parameter_in_the_installed_file_exists():
-    from importlib import import_module
-
-    from limbloc_ros.core.config import from_mapping
-    from limbloc_ros.nodes.graph_plan import load_config
-
-    config = load_config(CONFIG / "smart_space.yaml")
+@pytest.mark.parametrize("name", ["smart_space", "smart_space_4_cameras", "smart_space_8_cameras"])
+def test_every_parameter_in_the_installed_files_exists(name):
+    config = load_config(CONFIG / f"{name}.yaml")
+    whole = name == "smart_space"
     for section in NODE_SECTIONS:
         module = import_module(f"limbloc_ros.nodes.{section}")
         settings = [v for v in vars(module).values() if isinstance(v, type) and hasattr(v, "__dataclass_fields__")]
         known = {field.name: kind for kind in settings for field in fields(kind)}
-        for name, value in flatten(getattr(config, section)).items():
-            leaf = name.rpartition(".")[2]
-            assert leaf in known, f"{section}: {name}"
+        for key, value in flatten(getattr(config, section)).items():
+            leaf = key.rpartition(".")[2]
+            assert leaf in known, f"{section}: {key}"
             made = from_mapping(known[leaf], {leaf: value})  # right type and within its bounds
-            other = (section, name) in OTHER_THAN_THE_DEFAULT
-            assert (made == known[leaf]()) != other, f"{section}: {name}: the file says that it is the default"
+            other = (section, key) in OTHER_THAN_THE_DEFAULT
+            if whole:
+                assert (made == known[leaf]()) != other, f"{section}: {key}: the file says that it is the default"
 
 
 def test_node_sections_are_the_nodes():
     assert set(NODE_SECTIONS) == set(KINDS)
 
 
-def test_the_rig_example_is_a_rig_whose_cameras_see_the_volume():
-    rig = load_rig(CONFIG / "rig_example.yaml")
-    centre = (rig.volume_min + rig.volume_max) / 2
+@pytest.mark.parametrize("count", [4, 8])
+def test_the_examples_for_four_and_eight_cameras_can_be_run_as_they_are(count, tmp_path):
+    """With real cameras and with simulated ones; each camera sees most of the carve volume's floor and head height."""
+    rig = load_rig(CONFIG / f"rig_{count}_cameras.yaml")
+    assert len(rig.cameras) == count
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0.0, 0.75)])
+    places = rig.volume_min + (rig.volume_max - rig.volume_min) * (0.2 + 0.6 * corners * [1, 1, 1 / 0.75])
     for camera in rig.cameras:
-        uv, depth = camera.world_to_image(centre)
-        assert depth > 1.0
-        assert 0 <= uv[0] < camera.width and 0 <= uv[1] < camera.height
+        uv, depth = camera.world_to_image(places)
+        inside = (depth > 0) & (uv >= 0).all(axis=1) & (uv < [camera.width, camera.height]).all(axis=1)
+        assert inside.mean() >= 0.5, camera.name
+        np.testing.assert_allclose(np.linalg.det(camera.T_world_camera[:3, :3]), 1.0, atol=1e-5)
+    for source in ("cameras", "simulated"):
+        config = load_config(CONFIG / f"smart_space_{count}_cameras.yaml", {"source": source})
+        kinds = [node["kind"] for process in plan_graph(config, tmp_path) for node in process.nodes]
+        assert kinds.count("segmentation") == count
 
 
 @pytest.mark.parametrize("name", ["fastdds.xml", "fastdds_localhost.xml"])
