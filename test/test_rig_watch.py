@@ -74,7 +74,7 @@ def test_diagnostics_name_the_camera():
     for i in range(FEWEST + 1):
         masks = case.masks(i)
         for name, mask in masks.items():
-            report.mask(name, mask, 0.0)
+            report.mask(name, mask, i, 0.0)
         report.carved(FrameSet(i, masks, (), 0), NoPerson("too small"), 1.0, 0.0)
         statuses = report.statuses(None, NothingWaits(), {}, rig)
     levels = {status.name: status.level for status in statuses if ": camera " in status.name}
