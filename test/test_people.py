@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from limbloc_ros.core import hull as hulls
+from limbloc_ros.core.confidence import CUT_M2
 from limbloc_ros.core.config import FitConfig, HullConfig
 from limbloc_ros.core.errors import InputError, NoPerson
 from limbloc_ros.core.figure import FigureState
@@ -311,6 +312,27 @@ def test_two_who_touch_keep_their_bodies_apart() -> None:
     assert sorted(owner.values()) == [0, 1]
     assert np.median(errors) < 0.06, np.round(errors, 3)
     assert np.mean(errors) < 0.09
+
+
+def test_who_comes_in_is_searched_when_wholly_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Half a person is fitted in vain, and three fits in vain make furniture that rests."""
+    stage = room(3, "crossing")
+    people = People(FitConfig(temporal=True))
+    estimate, cut = PoseEstimator.estimate, []
+
+    def fit(self: PoseEstimator, hull: Hull, others: tuple = ()) -> Pose | NoPerson:
+        if self is not people.estimator:  # the first is fitted from the start
+            cut.append(hull.cut_area_m2)
+        return estimate(self, hull, others)
+
+    monkeypatch.setattr(PoseEstimator, "estimate", fit)
+    seen_cut = 0
+    for t in np.arange(0.6, 1.8, 0.2):
+        seen = people.look(carved(stage, float(t)))
+        seen_cut += sum(part.cut_area_m2 >= CUT_M2 for part in seen.hulls()[1:])
+        people.follow(seen, round(t * 1e9))
+    assert seen_cut > 2
+    assert cut == [area for area in cut if area < CUT_M2]
 
 
 def test_a_chair_beside_somebody_is_not_a_person() -> None:

@@ -33,6 +33,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from limbloc_ros.core import figure
+from limbloc_ros.core.confidence import CUT_M2
 from limbloc_ros.core.config import FitConfig
 from limbloc_ros.core.errors import InputError, NoPerson
 from limbloc_ros.core.figure import FigureState
@@ -269,7 +270,7 @@ class People:
                 taken.append(track)
                 if track is self._alone or track.number or (track.looked_ns is not None and track.score > FURNITURE):
                     fits.append((track, partial(sight.fit, n, track.estimator)))
-                elif not track.rests(stamp_ns):
+                elif not track.rests(stamp_ns) and not self._half_inside(sight, n):
                     newcomers.append((track, n))
                 continue
             pieces = divide(sight.hulls()[n], [_distance(track, stamp_ns) for track in claimants])
@@ -292,6 +293,14 @@ class People:
         for (track, _), outcome in zip(fits, _side_by_side([fit for _, fit in fits]), strict=True):
             track.judge(stamp_ns, outcome)
         return taken
+
+    def _half_inside(self, sight: Sight, n: int) -> bool:
+        """Whether part n is cut by the carve volume's walls: whoever comes in is searched when wholly there.
+
+        A search is long, and of half a person in vain; three in vain would have the newcomer rest. Where every frame is
+        fitted alone, all parts are: the fits may have been done already.
+        """
+        return self.config.temporal and sight.hulls()[n].cut_area_m2 >= CUT_M2
 
     def _begin(self, part: Part, stamp_ns: int) -> _Track:
         estimator = PoseEstimator(self.config) if self._tracks else self.estimator
