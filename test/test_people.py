@@ -129,11 +129,11 @@ def test_two_balls_are_cut_apart_half_way() -> None:
 
 @cache
 def somebody() -> tuple[Hull, Pose]:
-    hull = components(carved(room(2, "apart"), 7.5))[0]
-    pose = PoseEstimator(FitConfig(temporal=True)).estimate(hull)
+    seen = Sight.of(carved(room(2, "apart"), 7.5), 2)
+    pose = seen.fit(0, PoseEstimator(FitConfig(temporal=True)))
     assert isinstance(pose, Pose)
     assert pose.reliable
-    return hull, pose
+    return seen.hulls()[0], pose
 
 
 def at(x: float, y: float, good: bool = True) -> tuple[Part, Pose]:
