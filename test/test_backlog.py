@@ -60,6 +60,23 @@ def test_who_is_too_far_behind_skips_all_but_the_newest_and_says_up_to_where(gra
     assert (done, backlog.skipped) == ([4], 4)
 
 
+def test_who_has_skipped_waits_less_for_some_seconds_and_skips_every_second(graph: Graph) -> None:
+    done: list[int] = []
+    backlog: Backlog[int] = Backlog(graph.tester, done.append, 5 * FRAME_NS / 1e9, again_s=3 * FRAME_NS / 1e9)
+    for n in range(7):
+        backlog.add(n * FRAME_NS, n)
+    assert (len(backlog), backlog.skipped) == (1, 6)
+    for n in range(7, 11):
+        backlog.add(n * FRAME_NS, n)
+    assert backlog.skipped == 8
+    graph.until(lambda: len(backlog) == 0)
+    assert done == [6, 8, 10]
+    later = 130  # frames: more than ten seconds
+    for n in range(later, later + 5):
+        backlog.add(n * FRAME_NS, n)
+    assert (len(backlog), backlog.skipped) == (5, 8)
+
+
 def test_what_others_skipped_is_skipped_also_when_it_comes_later(graph: Graph) -> None:
     done: list[int] = []
     backlog: Backlog[int] = Backlog(graph.tester, done.append, 10.0)

@@ -63,6 +63,14 @@ class PoseSettings:
         high=10.0,
         live=True,
     )
+    catch_up_again_s: float = setting(
+        0.25,
+        "for 10 s after that only so long; then every second is skipped: fewer poses, not later ones",
+        unit="s",
+        low=0.0,
+        high=10.0,
+        live=True,
+    )
 
 
 class PoseNode(Node):
@@ -94,7 +102,9 @@ class PoseNode(Node):
         self.surface = self.create_publisher(PointCloud2, topics.SURFACE, topics.STREAM_QOS)
         self.bodies = BodiesOutput(self, self.settings.body_id, self.settings.publish_tf)
         self.health = Health(self, self.describe)
-        self.backlog: Backlog[PointCloud2] = Backlog(self, self.fit, self.settings.catch_up_s)
+        self.backlog: Backlog[PointCloud2] = Backlog(
+            self, self.fit, self.settings.catch_up_s, again_s=self.settings.catch_up_again_s
+        )
         self.create_subscription(PointCloud2, topics.HULL, self.on_hull, topics.WORK_QOS)
         self.get_logger().info("ready")
 
@@ -193,7 +203,7 @@ class PoseNode(Node):
 
     def _on_settings(self, settings: PoseSettings) -> None:
         self.settings = settings
-        self.backlog.longest_s = settings.catch_up_s
+        self.backlog.longest_s, self.backlog.again_s = settings.catch_up_s, settings.catch_up_again_s
 
     def _on_fit_config(self, config: FitConfig) -> None:
         self.people = People(config)

@@ -22,6 +22,8 @@ from limbloc_ros.ros.messages import NANOSECONDS
 
 T = TypeVar("T")
 
+#: Who has skipped something is held to be too slow for good for so long, by stamps, s.
+SLOW_FOR_S = 10.0
 #: The work's timer fires as soon as the executor is free. (The events executor knows no guard conditions.)
 _AT_ONCE_S = 1e-6
 
@@ -35,6 +37,8 @@ class Backlog(Generic[T]):
         longest_s: how far, in acquisition stamps, the oldest waiting item may lie behind the newest. Beyond this all
             but the newest are skipped: what is late anyway shall not make the next frames late as well.
         on_skip: told the newest stamp (ns) that was skipped.
+        again_s: for SLOW_FOR_S after that, how far it may lie behind before every second item that waits is skipped: a
+            machine that is too slow for good shall give fewer results, not later ones, and evenly. None: as ever.
 
     Attributes:
         skipped: items that were thrown away.
@@ -46,8 +50,9 @@ class Backlog(Generic[T]):
         work: Callable[[T], None],
         longest_s: float,
         on_skip: Callable[[int], None] | None = None,
+        again_s: float | None = None,
     ) -> None:
-        self.longest_s = longest_s
+        self.longest_s, self.again_s = longest_s, again_s
         self.skipped = 0
         self._skipped_s = -WINDOW_S
         self._work = work
@@ -55,6 +60,7 @@ class Backlog(Generic[T]):
         self._items: deque[tuple[int, T]] = deque()
         self._skip_until_ns: int | None = None
         self._last_ns: int | None = None
+        self._slow_ns: int | None = None
         self._wake = node.create_timer(_AT_ONCE_S, self._on_wake, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._wake.cancel()
 
@@ -77,13 +83,23 @@ class Backlog(Generic[T]):
             self._count(1)
             return
         self._items.append((stamp_ns, item))
-        if stamp_ns - self._items[0][0] > self.longest_s * NANOSECONDS and len(self._items) > 1:
+        late_s = (stamp_ns - self._items[0][0]) / NANOSECONDS
+        if late_s > self.longest_s and len(self._items) > 1:
+            self._slow_ns = stamp_ns
             until = self._items[-2][0]
             self.skip_until(until)
             if self._on_skip is not None:
                 self._on_skip(until)
+        elif self.again_s is not None and late_s > self.again_s and self._is_slow(stamp_ns):
+            self._slow_ns = stamp_ns
+            kept = list(self._items)[::-2][::-1]  # with the newest
+            self._count(len(self._items) - len(kept))
+            self._items = deque(kept)
         if len(self._items) == 1:
             self._wake.reset()
+
+    def _is_slow(self, stamp_ns: int) -> bool:
+        return self._slow_ns is not None and 0 <= stamp_ns - self._slow_ns < SLOW_FOR_S * NANOSECONDS
 
     def skip_until(self, stamp_ns: int) -> None:
         """Throw away what waits with this stamp (ns) or an older one, and what comes with one later."""
