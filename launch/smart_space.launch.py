@@ -32,7 +32,7 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
 from launch import LaunchDescription
-from limbloc_ros.nodes.graph_plan import plan_graph
+from limbloc_ros.nodes.graph_plan import plan_graph, refuse_old_recording
 from limbloc_ros.nodes.smart_space import config_from_arguments
 from limbloc_ros.ros.environment import config_file, graph_environment
 from limbloc_ros.ros.supervisor import End, RestartDelay, enclave_of, meaning_of
@@ -99,6 +99,7 @@ def start(context):
     options = {name: given[name] or None for name in ("config", "source", "rig", "bag", "cameras", "record")}
     options["foxglove"] = port if port or foxglove in YES else None
     config = config_from_arguments(argparse.Namespace(**options, set=shlex.split(given["set"])))
+    refuse_old_recording(config)
     folder = tempfile.TemporaryDirectory(prefix="limbloc_")
     atexit.register(folder.cleanup)  # not sooner: at the shutdown processes may still be reading
     plans = plan_graph(config, Path(folder.name))

@@ -3,10 +3,11 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -19,6 +20,7 @@ from sensor_msgs.msg import Image
 from limbloc_ros.core.errors import ConfigError
 from limbloc_ros.nodes import composed
 from limbloc_ros.recordings.bags import BagWriter
+from limbloc_ros.ros.node_main import ENDED
 
 
 @pytest.fixture
@@ -71,6 +73,21 @@ def test_the_process_ends_with_the_recording_also_when_a_file_describes_it(tmp_p
     )
     assert ended.returncode == 0, ended.stderr
     assert "replayed 1 messages" in ended.stdout
+
+
+def test_a_recorder_that_fails_does_not_ask_for_the_end_of_all(
+    nodes: list[Node], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A full disk is no reason to stop a live room; a recording that cannot be replayed is."""
+
+    def main(make: Callable[[], list[Node]], *_: object) -> int:
+        nodes.extend(make())
+        nodes[-1].error = "only 63 MB of disk are left"
+        return 0
+
+    monkeypatch.setattr(composed.node_main, "main", main)
+    entry = {"kind": "record", "parameters": {"bag": str(tmp_path / "bag")}}
+    assert composed.run(["composed", json.dumps({"nodes": [entry]})]) == ENDED
 
 
 def test_what_cannot_be_run_is_said_in_one_line(tmp_path: Path) -> None:

@@ -30,7 +30,17 @@ from limbloc_ros.ros import shared_memory
 from limbloc_ros.ros import supervisor as supervising
 from limbloc_ros.ros.environment import NetworkConfig, config_file, graph_environment
 from limbloc_ros.ros.process_starter import ProcessStarter, StartedProcess
-from limbloc_ros.ros.supervisor import SETTLED_S, ProcessConfig, ProcessPlan, RestartDelay, Supervisor
+from limbloc_ros.ros.supervisor import (
+    ENDED,
+    REFUSED,
+    SETTLED_S,
+    End,
+    ProcessConfig,
+    ProcessPlan,
+    RestartDelay,
+    Supervisor,
+    meaning_of,
+)
 from limbloc_ros.simulation.room import default_rig
 
 DOMAIN = 1 + os.getpid() % 100
@@ -356,6 +366,22 @@ def test_the_delay_grows_while_a_process_keeps_dying():
     delays = [line.rsplit(" in ", 1)[1] for line in lines if "starting it again" in line]
     assert delays[:3] == ["0.1 s", "0.2 s", "0.3 s"]
     assert any(line.startswith("[broken] ") for line in lines)
+
+
+def test_a_recorder_that_dies_goes_on_in_the_next_folder_and_one_without_disk_ends_alone(tmp_path):
+    """It used to find its own folder, refuse, and take the whole graph along; so did a full disk."""
+    overrides = {"record_to": str(tmp_path / "bag"), "simulated_cameras": {"number_of_cameras": 2}}
+    lines, config = Lines(), load_config(config_file("smart_space.yaml"), overrides)
+    plans = [plan for plan in plan_graph(config, tmp_path) if plan.name == "record"]
+    with Supervisor(plans, graph_environment(NETWORK), FAST, lines.append) as supervisor:
+        lines.wait_for(supervisor, f"recording to {tmp_path / 'bag'}")
+        os.kill(supervisor.pids["record"], signal.SIGKILL)
+        lines.wait_for(supervisor, f"recording to {tmp_path / 'bag_2'}")
+    assert supervisor.failure == ""
+    for code, end in ((ENDED, End.DONE), (0, End.DONE), (REFUSED, End.REFUSED), (-9, End.DIED), (1, End.DIED)):
+        assert meaning_of(plans[0], code) is end
+    with pytest.raises(ConfigError, match=r"record_to: .*bag exists already"):
+        smart_space.run(config)
 
 
 def test_a_process_may_keep_dying_for_days():

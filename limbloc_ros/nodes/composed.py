@@ -33,7 +33,7 @@ from rclpy.utilities import remove_ros_args
 from limbloc_ros.core.errors import ConfigError
 from limbloc_ros.rig.plain_values import yaml_values
 from limbloc_ros.ros import node_main
-from limbloc_ros.ros.node_main import REFUSED
+from limbloc_ros.ros.node_main import ENDED, REFUSED
 
 #: Node classes by kind; their modules are imported when asked for, because each brings its own libraries.
 KINDS = {
@@ -105,7 +105,10 @@ def run(argv: Sequence[str] | None = None) -> int:
     for node in nodes:
         if hasattr(node, "summary"):
             print(node.summary(), flush=True)
-    return REFUSED if any(getattr(node, "error", None) for node in nodes) else code
+    failed = {entry["kind"] for entry, node in zip(entries, nodes, strict=False) if getattr(node, "error", None)}
+    if failed == {"record"}:  # the disk is full: the others go on
+        return ENDED
+    return REFUSED if failed else code
 
 
 def parse(text: str) -> Mapping[str, Any]:

@@ -104,6 +104,12 @@ def config_from_mapping(values: Mapping[str, Any]) -> SmartSpaceConfig:
     return from_mapping(SmartSpaceConfig, values)
 
 
+def refuse_old_recording(config: SmartSpaceConfig) -> None:
+    """Raise ConfigError when the folder to record to is there before the start."""
+    if config.record_to and Path(config.record_to).exists():
+        raise ConfigError(f"record_to: {config.record_to} exists already; choose another folder, or remove it")
+
+
 def plan_graph(config: SmartSpaceConfig, run_folder: Path) -> list[ProcessPlan]:
     """Which processes with which nodes the config asks for.
 
@@ -242,7 +248,8 @@ class _Plan:
             self._add("carving", carving)
             self._add("pose", pose)
         if c.record_to:
-            self._add("record", _node("record", "record", {**c.record, "bag": c.record_to}))
+            # When it has died, the supervisor starts it again, and the folder is there.
+            self._add("record", _node("record", "record", {"if_exists": "next", **c.record, "bag": c.record_to}))
         if c.foxglove:
             self._add("foxglove", _node("foxglove_bridge", "foxglove_bridge", c.foxglove_bridge))
         return self.processes

@@ -55,6 +55,12 @@ class RecordSettings:
         choices=("auto", "raw", "compressed", "none"),
     )
     duration_s: float = setting(0.0, "end by itself after this (0: until stopped)", unit="s", low=0.0, high=1e6)
+    if_exists: str = setting(
+        "refuse",
+        "what to do when the folder is there: refuse, or make the next one, NAME_2, NAME_3, ... (a recorder that died "
+        "and is started again)",
+        choices=("refuse", "next"),
+    )
 
 
 class RecordNode(Node):
@@ -83,6 +89,8 @@ class RecordNode(Node):
         self._seen: dict[str, int] = {}
         self._refused: set[str] = set()
         self.path = Path(s.bag or datetime.now().strftime("limbloc_%Y%m%d_%H%M%S"))
+        if s.if_exists == "next":
+            self.path = next_free(self.path)
         self.writer = BagWriter(self.path, s.storage)
         self._started = time.monotonic()
         self._times: dict[str, tuple[float, float]] = {}
@@ -184,6 +192,15 @@ class RecordNode(Node):
         self.error = str(error)
         self.get_logger().fatal(self.error)
         self.done.set()
+
+
+def next_free(path: Path) -> Path:
+    """The path itself, or with _2, _3, ... behind it the first that is not there."""
+    number, free = 1, path
+    while free.exists():
+        number += 1
+        free = path.with_name(f"{path.name}_{number}")
+    return free
 
 
 def main() -> int:

@@ -116,10 +116,11 @@ def run(config: SmartSpaceConfig) -> int:
     import tempfile
     from pathlib import Path
 
-    from limbloc_ros.nodes.graph_plan import plan_graph
+    from limbloc_ros.nodes.graph_plan import plan_graph, refuse_old_recording
     from limbloc_ros.ros.environment import graph_environment
     from limbloc_ros.ros.supervisor import Supervisor
 
+    refuse_old_recording(config)
     with tempfile.TemporaryDirectory(prefix="limbloc_") as folder:
         plans = plan_graph(config, Path(folder))
         environment = graph_environment(config.network)

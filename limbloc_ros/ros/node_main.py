@@ -22,6 +22,8 @@ from limbloc_ros.core.interrupts import interrupt
 
 #: Exit code when a node refused its parameters or input: starting again would not help.
 REFUSED = 2
+#: Exit code when what it did came to an end before its time, which it has told; starting again would not help either.
+ENDED = 3
 
 
 def make_executor(context: Context | None = None) -> Executor:

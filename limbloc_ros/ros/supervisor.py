@@ -33,6 +33,8 @@ ABANDONED_MB = 64
 ENCLAVES = "/limbloc"
 #: Exit code of `nodes.composed` when a node refused its parameters or input.
 REFUSED = 2
+#: Exit code of `nodes.composed` when it could not go on, which is no reason for the others to end: a full disk.
+ENDED = 3
 
 
 @dataclass(frozen=True)
@@ -81,6 +83,8 @@ def meaning_of(plan: ProcessPlan, code: int) -> End:
         return End.REFUSED
     if code == 0 and plan.ends_graph:
         return End.OVER
+    if code == ENDED:
+        return End.DONE
     if code == 0 and all(node["kind"] in ("replay", "record") for node in plan.nodes):
         return End.DONE
     return End.DIED
