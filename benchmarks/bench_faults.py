@@ -23,7 +23,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
-from faults.live import Live, Said, steady
+from faults.live import Answer, Live, Said, steady
 from faults.processes import Footprint, footprint
 from faults.scenarios import SCENARIOS, Scenario
 
@@ -37,8 +37,8 @@ class Outcome:
     """What a scenario showed.
 
     Attributes:
-        filmed, published, wrong: instants filmed, poses published, wrong ones among them, from the fault's begin until
-            the graph is right again.
+        filmed, published, guests, wrong: instants filmed, poses published, those of a second person, wrong ones among
+            both, from the fault's begin until the graph is right again.
         warned_s: from the fault's begin to the first new warning; None: never.
         warning: it.
         right_s: from the fault's end (or begin, when it stays) to the first of five right answers; None: never.
@@ -51,6 +51,7 @@ class Outcome:
     title: str
     filmed: int
     published: int
+    guests: int
     wrong: int
     warned_s: float | None
     warning: str
@@ -64,7 +65,8 @@ def run(live: Live, scenario: Scenario, verbose: bool = False) -> Outcome:
     """Begin, wait, end, wait."""
     restarts, before = sum(live.graph.restarts.values()), footprint(live.graph.pids)
     bad = {name for name, (level, _) in live.levels.items() if level}
-    first_said, first_answer, began = len(live.said), len(live.answers), time.monotonic()
+    first_said, first_answer, first_guest = len(live.said), len(live.answers), len(live.guests)
+    began = time.monotonic()
     scenario.begin(live)
     live.spin(scenario.lasts_s)
     counted_from = began
@@ -77,19 +79,21 @@ def run(live: Live, scenario: Scenario, verbose: bool = False) -> Outcome:
     until = time.monotonic() if right_at is None else right_at
     answers = [a for a in live.answers[first_answer:] if a.at_s < until]
     filmed = sum(began <= at_s < until for at_s in live.cameras.filmed_s)
+    guests = live.guests[first_guest:]
     rest = len(live.answers)
     live.spin(AFTER_S)
     said = [s for s in live.said[first_said:] if s.level and s.at_s <= until + 1.0]
     new = [s for s in said if s.name not in bad and ": posture" not in s.name] or said
     if verbose:
-        show(live, first_said, first_answer, began)
+        show(live, first_said, live.answers[first_answer:] + live.guests[first_guest:], began)
     after = footprint(live.graph.pids)
     return Outcome(
         scenario.name,
         scenario.title,
         filmed,
         sum(a.posed for a in answers),
-        sum(a.wrong for a in answers),
+        sum(a.posed for a in guests),
+        sum(a.wrong for a in (*answers, *guests)),
         new[0].at_s - began if new else None,
         f"{new[0].name}: {new[0].message}" if new else "",
         None if right_at is None else max(right_at - counted_from, 0.0),
@@ -99,10 +103,10 @@ def run(live: Live, scenario: Scenario, verbose: bool = False) -> Outcome:
     )
 
 
-def show(live: Live, first_said: int, first_answer: int, began: float) -> None:
+def show(live: Live, first_said: int, answers: list[Answer], began: float) -> None:
     """Everything that was heard, in order."""
     events: list[tuple[float, str]] = [(s.at_s, _say(s)) for s in live.said[first_said:]]
-    for a in live.answers[first_answer:]:
+    for a in answers:
         mark = "right" if a.right else "WRONG" if a.wrong else "no pose"
         events.append((a.at_s, f"  {mark} {1e3 * a.error_m[0]:.0f} {1e3 * a.error_m[1]:.0f} mm, there: {a.there}"))
     for at_s, text in sorted(events):
@@ -122,13 +126,14 @@ def make_live(scenario: Scenario) -> Live:
 def table(outcomes: list[Outcome]) -> str:
     """As Markdown."""
     lines = [
-        "| fault | images | poses | wrong | first warning | after s | right again after s |",
-        "|---|---|---|---|---|---|---|",
+        "| fault | poses / images | wrong | first warning | after s | right again after s |",
+        "|---|---|---|---|---|---|",
     ]
     for o in outcomes:
         warned = "" if o.warned_s is None else f"{o.warned_s:.1f}"
         right = "never" if o.right_s is None else f"{o.right_s:.1f}"
-        lines.append(f"| {o.title} | {o.filmed} | {o.published} | {o.wrong} | {o.warning} | {warned} | {right} |")
+        poses = f"{o.published} and {o.guests}" if o.guests else f"{o.published}"
+        lines.append(f"| {o.title} | {poses} / {o.filmed} | {o.wrong} | {o.warning} | {warned} | {right} |")
     return "\n".join(lines)
 
 

@@ -47,7 +47,7 @@ class Cameras:
     Attributes:
         tampers: the fault of a camera, by name.
         shift_s: added to the stamps (a clock that was set, a bag that is looped).
-        truth: what was there, by stamp: joints [25, 3] or None.
+        truth: what was there, by stamp: joints [25, 3] or None; guests: the same of the second person.
         filmed_s: when each instant was filmed, monotonic clock.
         filming: whether they send anything.
     """
@@ -58,6 +58,7 @@ class Cameras:
         self.tampers: dict[str, Tamper] = {}
         self.shift_s = 0.0
         self.truth: dict[int, NDArray[np.float64] | None] = {}
+        self.guests: dict[int, NDArray[np.float64] | None] = {}
         self.filmed_s: list[float] = []
         self.filming = True
         self._publishers = {
@@ -89,7 +90,7 @@ class Cameras:
         wall_ns = time.time_ns()
         images, joints = self.stage.shoot(self.period_s, wall_ns / NANOSECONDS)
         stamp_ns = wall_ns + round(self.shift_s * NANOSECONDS)
-        self.truth[stamp_ns] = joints
+        self.truth[stamp_ns], self.guests[stamp_ns] = joints, self.stage.guest_joints
         self.filmed_s.append(now)
         if not self.filming:
             return

@@ -95,7 +95,7 @@ class Live:
 
     Attributes:
         stage, cameras: what is filmed, and by whom.
-        answers, said: everything heard so far.
+        answers, guests, said: everything heard so far; guests: the poses of a second person.
         lines: the processes' output.
     """
 
@@ -116,6 +116,7 @@ class Live:
         self.domain = int(os.environ.get("ROS_DOMAIN_ID") or 1 + os.getpid() % 100) if domain is None else domain
         self._settings = dict(settings or {})
         self.answers: list[Answer] = []
+        self.guests: list[Answer] = []
         self.said: list[Said] = []
         self.values: dict[str, dict[str, str]] = {}
         self.lines: list[str] = []
@@ -144,6 +145,7 @@ class Live:
         self._executor = make_executor(self._context)
         self._executor.add_node(self.node)
         self.node.create_subscription(PoseArray, topics.JOINTS, self._on_joints, topics.STREAM_QOS)
+        self.node.create_subscription(PoseArray, topics.body_joints("p2"), self._on_guest, topics.STREAM_QOS)
         self.node.create_subscription(DiagnosticArray, topics.DIAGNOSTICS, self._on_diagnostics, topics.DIAGNOSTICS_QOS)
         self.cameras = Cameras(self.node, self.stage, self._rate_hz, f"{namespace}/" if namespace else "")
         if self._relayed:
@@ -211,11 +213,15 @@ class Live:
         return self.until(lambda: steady(self.answers[first:]) is not None, seconds)
 
     def _on_joints(self, msg: PoseArray) -> None:
+        self.answers.append(self._answer(msg, self.cameras.truth))
+
+    def _on_guest(self, msg: PoseArray) -> None:
+        self.guests.append(self._answer(msg, self.cameras.guests))
+
+    def _answer(self, msg: PoseArray, truths: Mapping[int, NDArray[np.float64] | None]) -> Answer:
         stamp, joints = stamp_ns(msg.header), message_to_joints(msg)
-        truth = self.cameras.truth.get(stamp)
-        self.answers.append(
-            Answer(time.monotonic(), stamp, joints is not None, error_of(joints, truth), truth is not None)
-        )
+        truth = truths.get(stamp)
+        return Answer(time.monotonic(), stamp, joints is not None, error_of(joints, truth), truth is not None)
 
     def _on_diagnostics(self, msg: DiagnosticArray) -> None:
         for status in msg.status:

@@ -16,7 +16,7 @@ import numpy as np
 
 from .cameras import Shot, Tamper
 from .live import Live
-from .stage import Image, at, lying
+from .stage import PACE, Image, at, lying
 
 Act = Callable[[Live], None]
 
@@ -222,6 +222,15 @@ def come_in(live: Live) -> None:
     live.stage.come_in()
 
 
+def guest(pace: float) -> Act:
+    """A second person comes in, or goes (a negative pace)."""
+
+    def act(live: Live) -> None:
+        live.stage.guest_pace = pace
+
+    return act
+
+
 def pose_as(posture: Callable[..., object] | None, box: bool = False) -> Act:
     """The person lies down, or goes somewhere, or takes something."""
 
@@ -314,6 +323,7 @@ SCENARIOS = (
     Scenario("chair", "a chair moved in beside the person", chair, no_chair, 12.0),
     Scenario("chair_alone", "the person goes, a chair stays", chair_alone, no_chair, 12.0),
     Scenario("leaves", "the person leaves, the room is empty, he returns", leave, come_in, 20.0),
+    Scenario("guest", "a second person comes in, stays, and goes", guest(PACE), guest(-PACE), 20.0),
     Scenario("half_out", "half out of the carve volume", pose_as(at(1.45, 0.2)), pose_as(None), 8.0),
     Scenario("lies", "lies on the floor, gets up", pose_as(lying), pose_as(None), 8.0),
     Scenario("box", "carries a box, puts it away", pose_as(None, True), pose_as(None), 8.0),

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from limbloc_ros.core.camera import Rig
 from limbloc_ros.core.pose import JOINT
 from limbloc_ros.simulation.motion import Motion
-from limbloc_ros.simulation.person import PosedPerson
+from limbloc_ros.simulation.person import Person, PosedPerson, load_person
 from limbloc_ros.simulation.room import SimulatedRoom
 
 Array = NDArray[np.float64]
@@ -53,6 +53,9 @@ PACE = 0.5
 #: In the room he paces slowly from side to side, m and s, standing relaxed: a posture that is followed without errors,
 #: so that those that are seen come from the faults.
 SWAY_M, SWAY_S = 0.35, 12.0
+
+#: The guest walks in and stands beside him, so far away, m.
+GUEST_AWAY_M = np.array([0.0, 1.0, 0.0])
 
 #: A chair with a seat at 45 cm and a back of 95 cm, beside the middle of the room.
 CHAIR = boxes(
@@ -104,6 +107,8 @@ class Stage(SimulatedRoom):
         posture: changes the person before he is drawn, or None.
         chair: where a chair stands on the floor [2], m, or None. box: whether the person carries one.
         light: what the cameras' images go through, or None.
+        guest_pace: how fast a second person goes on her way in (negative: out).
+        guest_joints: [25, 3] where she is, m, or None.
     """
 
     def __init__(self, rig: Rig, motions: tuple[str, ...], seed: int = 0) -> None:
@@ -115,9 +120,10 @@ class Stage(SimulatedRoom):
         self.chair: tuple[float, float] | None = None
         self.box = False
         self.light: Callable[[Image], Image] | None = None
-        times = np.arange(self.script.empty_s, self.script.empty_s + 20.0, 0.05)
-        #: Where in the motion the person has come in.
-        self.entered_s = float(next(t for t in times if self.script.action(t) != "walk"))
+        self.entered_s = _entered_s(self.script)
+        self.guest = Motion(load_person("woman"), seed + 1, empty_s=1.0, playlist=motions)
+        self.guest_time_s, self.guest_pace, self.guest_entered_s = 0.0, 0.0, _entered_s(self.guest)
+        self.guest_joints: Array | None = None
 
     def enter(self) -> None:
         """The person is in the room at once."""
@@ -135,6 +141,7 @@ class Stage(SimulatedRoom):
         """Nobody and nothing is there."""
         self.time_s, self.pace = 0.0, 0.0
         self.posture, self.chair, self.box = None, None, False
+        self.guest_time_s, self.guest_pace = 0.0, 0.0
 
     def shoot(self, seconds: float, clock_s: float) -> tuple[dict[str, Image], Array | None]:
         """Let `seconds` pass; all cameras' images and the true joints [25, 3], None while nobody is there.
@@ -150,48 +157,61 @@ class Stage(SimulatedRoom):
             self._inside_s = 0.0
         if posed is not None and self.posture is not None:
             posed = self.posture(posed)
-        self._show(posed)
+        self.guest_time_s += self.guest_pace * seconds
+        self.guest_time_s = min(max(self.guest_time_s, 0.0), self.guest_entered_s)
+        guest = self.guest.pose(self.guest_time_s)
+        guest = None if guest is None else guest.moved(GUEST_AWAY_M)
+        self.guest_joints = None if guest is None else guest.joints.copy()
+        self._show(posed, guest)
         images = {name: self.render(name, clock_s) for name in self.rig.names}
         if self.light is not None:
             images = {name: self.light(image) for name, image in images.items()}
         return images, None if posed is None else posed.joints.copy()
 
-    def _show(self, posed: PosedPerson | None) -> None:
-        """Put person and things on the stage as one mesh, which is what the renderer draws."""
-        things: list[Prop] = []
+    def _show(self, posed: PosedPerson | None, guest: PosedPerson | None) -> None:
+        """Put people and things on the stage as one mesh, which is what the renderer draws."""
+        drawn: list[tuple[Array, NDArray[np.int32], Array, Array, Array]] = []
+        if posed is not None:
+            drawn.append(_worn(posed, self.body, self._body_tone))
+        if guest is not None:
+            drawn.append(_worn(guest, self.guest.person, np.ones(len(guest.vertices))))
         if self.chair is not None:
-            things.append(CHAIR.moved(np.array([*self.chair, 0.0])))
+            drawn.append(_plain(CHAIR.moved(np.array([*self.chair, 0.0]))))
         if self.box and posed is not None:
-            things.append(BOX.moved(posed.joints[JOINT["torso_centre"]] + 0.28 * _forward(posed)))
+            drawn.append(_plain(BOX.moved(posed.joints[JOINT["torso_centre"]] + 0.28 * _forward(posed))))
         self._instant = None
-        if posed is None and not things:
+        if not drawn:
             self.motion = _Shown(None)  # type: ignore[assignment]
             return
-        vertices, faces, garments, tones = [], [], [], []
-        if posed is not None:
-            vertices, faces, garments, tones = (
-                [posed.vertices],
-                [self.body.faces],
-                [self.body.garments],
-                [self._body_tone],
-            )
-        for thing in things:
-            faces.append(thing.faces + sum(map(len, vertices)))
-            vertices.append(thing.vertices)
-            worn = np.full((len(thing.vertices), 4), -1.0)
-            worn[:, thing.garment] = 1.0
-            garments.append(worn)
-            tones.append(np.ones(len(thing.vertices)))
-        mesh = np.concatenate(vertices)
+        first = np.cumsum([0, *(len(vertices) for vertices, *_ in drawn)])
+        mesh = np.concatenate([vertices for vertices, *_ in drawn])
+        faces = np.concatenate([row[1] + n for row, n in zip(drawn, first, strict=False)])
         self.person = dataclasses.replace(
-            self.body, vertices=mesh, faces=np.concatenate(faces), garments=np.concatenate(garments)
+            self.body, vertices=mesh, faces=faces.astype(np.int32), garments=np.concatenate([row[2] for row in drawn])
         )
-        self._tone = np.concatenate(tones)
-        self._stripe = np.full(len(mesh), 0.5)
-        if posed is not None:
-            self._stripe[: len(posed.vertices)] = self.body.vertices[:, 2]
+        self._tone = np.concatenate([row[3] for row in drawn])
+        self._stripe = np.concatenate([row[4] for row in drawn])
         nothing = np.zeros((0, 3))
         self.motion = _Shown(PosedPerson(mesh, nothing, np.zeros((0, 3, 3)), nothing))  # type: ignore[assignment]
+
+
+def _worn(posed: PosedPerson, body: Person, tone: Array) -> tuple[Array, NDArray[np.int32], Array, Array, Array]:
+    """Vertices, faces, garments, tones and stripes of somebody."""
+    return posed.vertices, body.faces, body.garments, tone, body.vertices[:, 2]
+
+
+def _plain(thing: Prop) -> tuple[Array, NDArray[np.int32], Array, Array, Array]:
+    """The same of a thing."""
+    count = len(thing.vertices)
+    worn = np.full((count, 4), -1.0)
+    worn[:, thing.garment] = 1.0
+    return thing.vertices, thing.faces, worn, np.ones(count), np.full(count, 0.5)
+
+
+def _entered_s(script: Motion) -> float:
+    """Where in the motion somebody has come in."""
+    times = np.arange(script.empty_s, script.empty_s + 20.0, 0.05)
+    return float(next(t for t in times if script.action(t) != "walk"))
 
 
 def _forward(posed: PosedPerson) -> Array:
