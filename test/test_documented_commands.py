@@ -90,6 +90,8 @@ class Lab:
             self._link(name, master / "case_masks")
         elif name.endswith("room.yaml") or name in ("rig.yaml", "learn8.yaml"):
             self._copy(master / name.replace("room", "rig"), name)
+        elif name == "checked.yaml":
+            self._copy(master / "rig.yaml", name)
         elif name in ("lab.yaml", "my_room.yaml"):
             self._copy(ROOT / "config" / "smart_space.yaml", name)
         elif name.endswith(".trc"):

@@ -17,6 +17,7 @@ from limbloc_ros.recordings.config_file import load_config
 from limbloc_ros.recordings.open_source import open_source
 from limbloc_ros.rig.check import GOOD, Report, check
 from limbloc_ros.rig.consistency import Mask, low_view, shrink_masks
+from limbloc_ros.rig.fine_check import FineFrames, look_closely
 from limbloc_ros.rig.rig_file import load_rig, save_rig
 
 DESCRIPTION = """\
@@ -24,15 +25,16 @@ Find out from footage with one person in it whether a rig file is right. The per
 and what comes out is compared with every camera's own silhouette, together, in pairs, and without each camera.
 
 Found and said in words: wrong units, z not up or upside down, a floor that is elsewhere, exchanged cameras, a camera
-that is late, a camera that was moved (by how much), and one whose masks or lens are wrong. INPUT is what
-`limbloc process` takes: a bag, a folder of videos or pictures, silhouettes (--masks), or a benchmark case.
+that is late, a camera that was moved (by how much), and one whose masks or lens are wrong. Where nothing of that kind is
+found, larger images tell whether one camera is off by some pixels. INPUT is what `limbloc process` takes: a bag, a
+folder of videos or pictures, silhouettes (--masks), or a benchmark case.
 """
 
 EPILOG = """\
 examples:
   limbloc rig check videos/ --rig rig.yaml --background empty_room/
   limbloc rig check silhouettes/ --rig rig.yaml --masks --height 1.78 --report check/
-  limbloc rig check bags/walk --rig rig.yaml --fix better.yaml        the moved camera put where it seems to be
+  limbloc rig check bags/walk --rig rig.yaml --fix checked.yaml       a camera that is off put where it seems to be
   limbloc rig check test/data/benchmark/public/seq_walk_circle
 
 Exit codes: 0 nothing severe, 1 something is wrong, 2 wrong input. A delay can only be seen when the person moves.
@@ -56,7 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--height", type=float, metavar="METRES", help="how tall the person is: checks the scale")
     parser.add_argument("--report", type=Path, metavar="DIR", help="write a page with pictures there")
     parser.add_argument(
-        "--fix", type=Path, metavar="YAML", help="write the rig with moved cameras where they seem to be"
+        "--fix", type=Path, metavar="YAML", help="write the rig, with a camera that is off put where it seems to be"
     )
 
 
@@ -75,7 +77,7 @@ def run(args: argparse.Namespace) -> int:
         fps=args.fps,
     )
     views = [low_view(camera) for camera in source.rig.cameras]
-    recording, stamps = [], []
+    recording, stamps, closely = [], [], FineFrames(source.rig)
     with tqdm(total=args.frames, unit="frame", disable=None, desc="masks") as bar:
         for i, masks in enumerate(source.mask_sets()):
             if i >= args.skip + args.frames:
@@ -83,6 +85,7 @@ def run(args: argparse.Namespace) -> int:
             bar.update(i >= args.skip)
             if i >= args.skip and masks.masks:
                 recording.append(shrink_masks(views, masks.masks))
+                closely.add(masks.masks)
                 stamps.append(masks.stamp_ns)
     if not recording:
         raise InputError(
@@ -92,12 +95,16 @@ def run(args: argparse.Namespace) -> int:
     even = source.about.get("consecutive", True) and len(steps) > 3 and np.ptp(steps) < 0.5 * np.median(steps)
     fps = float(1 / np.median(steps)) if even else None
     report = check(source.rig, recording, fps=fps, height_m=args.height)
+    look_closely(source.rig, report, closely)
     print(describe(source.rig, report, len(recording)))
     if args.report:
         print(f"report: {write_report(source.rig, report, args.report, str(args.input))}")
     if args.fix:
-        if not report.move:
-            print("--fix: no camera was found to be moved, nothing is written")
+        if not report.move and not report.good:
+            print("--fix: what is wrong is no single camera's place: nothing is written")
+        elif not report.move:
+            save_rig(source.rig, args.fix)
+            print(f"{args.fix}: the same cameras, none of them is off")
         else:
             save_rig(moved_rig(source.rig, report), args.fix)
             print(f"{args.fix}: {', '.join(report.move)} put where the silhouettes fit; calibrate again when you can")

@@ -11,7 +11,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from limbloc_ros.core.camera import Rig
-from limbloc_ros.rig.consistency import Grid, Mask, Scores, cover, inside, make_grid, mean_scores, score
+from limbloc_ros.rig.consistency import (
+    LOW_PX,
+    MOST_VOXELS,
+    Grid,
+    Mask,
+    Scores,
+    cover,
+    inside,
+    make_grid,
+    mean_scores,
+    score,
+)
 from limbloc_ros.rig.faults import Frame, Move, best_delay, best_move, contradiction, exchange, pair_table, swapped_pair
 from limbloc_ros.rig.geometry import Look, cameras_up, where_they_look
 
@@ -112,8 +123,8 @@ def check(rig: Rig, recording: Sequence[Frame], *, fps: float | None = None, hei
         return report
     most = max(len(recording[i]) for i in usable)
     full = [i for i in usable if len(recording[i]) == most]
-    chosen = _spread(full, COMPARED)
-    grid, _ = _find_person(rig, look, [recording[i] for i in chosen])
+    chosen = spread(full, COMPARED)
+    grid, _ = find_person(rig, look, [recording[i] for i in chosen])
     if grid is None:
         report.say(
             "masks",
@@ -124,37 +135,39 @@ def check(rig: Rig, recording: Sequence[Frame], *, fps: float | None = None, hei
     right: Sequence[Frame] = _agreement(rig, report, grid, recording, chosen, fps)
     again: Grid | None = grid
     if report.findings:  # look for the person anew, now that it is known who is right
-        again, right = _find_person(rig, look, right)
+        again, right = find_person(rig, look, right)
     if again is not None:
         _world(rig, report, again, right, height_m)
     return report
 
 
-def _spread(items: Sequence[int], count: int) -> list[int]:
+def spread(items: Sequence[int], count: int) -> list[int]:
     """At most `count` of the items, evenly."""
     at = np.unique(np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int))
     return [items[i] for i in at]
 
 
-def _find_person(rig: Rig, look: Look, frames: Sequence[Frame]) -> tuple[Grid | None, Sequence[Frame]]:
+def find_person(
+    rig: Rig, look: Look, frames: Sequence[Frame], voxels: int = MOST_VOXELS, low_px: int = LOW_PX
+) -> tuple[Grid | None, Sequence[Frame]]:
     """Voxels around where the person is, first coarsely in all that the cameras see; whatever the unit and the up."""
     half = 0.9 * float(np.median(look.distances))
     # For the search lenses may be plain: where the person is matters, not their outline.
     plain = tuple(replace(camera, distortion=np.zeros(0), distortion_model="none") for camera in rig.cameras)
-    grid = make_grid(replace(rig, cameras=plain), look.point - half, look.point + half, SEARCH_VOXELS)
+    grid = make_grid(replace(rig, cameras=plain), look.point - half, look.point + half, SEARCH_VOXELS, low_px)
     for finer in (False, True):
-        most = [_hull(grid, frame, tolerant=True) for frame in frames]
+        most = [hull_voxels(grid, frame, tolerant=True) for frame in frames]
         inside_any = np.unique(np.concatenate(most)) if most else np.zeros(0, np.int64)
         if len(inside_any) == 0:
             return (None if not finer else grid), frames
         points = grid.points[inside_any]
         margin = 2.5 * grid.voxel
         if not finer:
-            grid = make_grid(rig, points.min(axis=0) - margin, points.max(axis=0) + margin)
+            grid = make_grid(rig, points.min(axis=0) - margin, points.max(axis=0) + margin, voxels, low_px)
     return grid, frames
 
 
-def _hull(grid: Grid, frame: Frame, tolerant: bool = False) -> NDArray[np.int64]:
+def hull_voxels(grid: Grid, frame: Frame, tolerant: bool = False) -> NDArray[np.int64]:
     """Voxels that all cameras keep, or (tolerant) those that the fewest deny, up to a third of the cameras."""
     denials = np.zeros(len(grid.points), np.int64)
     seen = np.zeros(len(grid.points), np.int64)
@@ -171,7 +184,7 @@ def _hull(grid: Grid, frame: Frame, tolerant: bool = False) -> NDArray[np.int64]
 
 def _world(rig: Rig, report: Report, grid: Grid, frames: Sequence[Frame], height_m: float | None) -> None:
     """Unit, up and floor, from how big the person comes out and where."""
-    hulls = [grid.points[voxels] for frame in frames if len(voxels := _hull(grid, frame, tolerant=True))]
+    hulls = [grid.points[voxels] for frame in frames if len(voxels := hull_voxels(grid, frame, tolerant=True))]
     if not hulls:
         return
     up, agreement = cameras_up([camera.T_world_camera for camera in rig.cameras])
@@ -243,7 +256,9 @@ def _agreement(
     report.scores = mean_scores([score(grid, frame) for frame in frames], names)
     report.pairs = pair_table(grid, frames[::2], names)
     for c, view in enumerate(grid.views):
-        pairs = [(frame, _hull(grid, {k: m for k, m in frame.items() if k != c})) for frame in frames if c in frame]
+        pairs = [
+            (frame, hull_voxels(grid, {k: m for k, m in frame.items() if k != c})) for frame in frames if c in frame
+        ]
         if pairs:
             frame, rest = max(pairs, key=lambda pair: int(pair[0][c].sum()))
             report.overlays[view.camera.name] = frame[c], cover(grid, c, rest)
@@ -330,7 +345,7 @@ def _explain(
     keep: set[int] = set().union(*frames)
     if fps is not None:
         reach = min(DELAYS, (len(recording) - 1) // 3)
-        inner = _spread([i for i in range(reach, len(recording) - reach) if camera in recording[i]], COMPARED)
+        inner = spread([i for i in range(reach, len(recording) - reach) if camera in recording[i]], COMPARED)
         window = [{c: m for c, m in frame.items() if c in keep} for frame in recording]
         if reach and inner:
             delay, curve = best_delay(grid, window, inner, camera, reach)

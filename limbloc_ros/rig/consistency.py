@@ -100,9 +100,9 @@ class Scores:
         return np.asarray(self.together - self.without)
 
 
-def low_view(camera: Camera) -> LowView:
-    """A camera with small images."""
-    scale = min(1.0, LOW_PX / max(camera.width, camera.height))
+def low_view(camera: Camera, low_px: int = LOW_PX) -> LowView:
+    """A camera with small images, at most `low_px` wide and high."""
+    scale = min(1.0, low_px / max(camera.width, camera.height))
     width, height = max(2, round(scale * camera.width)), max(2, round(scale * camera.height))
     A = np.array([[width / camera.width, 0, 0.0], [0, height / camera.height, 0.0], [0, 0, 1]])
     A[:2, 2] = 0.5 * np.diag(A)[:2] - 0.5
@@ -131,14 +131,16 @@ def look_up(camera: Camera, points: Array) -> NDArray[np.int32]:
     return np.where(seen, y * camera.width + x, -1).astype(np.int32)
 
 
-def make_grid(rig: Rig, low: Array | None = None, high: Array | None = None, most: int = MOST_VOXELS) -> Grid:
-    """Voxels of the carve volume, or of the box from low to high, as fine as `most` voxels allow."""
+def make_grid(
+    rig: Rig, low: Array | None = None, high: Array | None = None, most: int = MOST_VOXELS, low_px: int = LOW_PX
+) -> Grid:
+    """Voxels of the carve volume, or of the box from low to high, as fine as `most` allows; images of `low_px`."""
     low = rig.volume_min if low is None else np.asarray(low, dtype=np.float64)
     high = rig.volume_max if high is None else np.asarray(high, dtype=np.float64)
     voxel = float(np.cbrt(np.prod(high - low) / most))
     axes = [np.arange(low[a] + 0.5 * voxel, high[a], voxel) for a in range(3)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    views = tuple(low_view(camera) for camera in rig.cameras)
+    views = tuple(low_view(camera, low_px) for camera in rig.cameras)
     middle = (low + high) / 2
     pixels = np.stack([look_up(view.camera, points) for view in views])
     reach = []
