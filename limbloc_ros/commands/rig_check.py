@@ -25,8 +25,8 @@ Find out from footage with one person in it whether a rig file is right. The per
 and what comes out is compared with every camera's own silhouette, together, in pairs, and without each camera.
 
 Found and said in words: wrong units, z not up or upside down, a floor that is elsewhere, exchanged cameras, a camera
-that is late, a camera that was moved (by how much), and one whose masks or lens are wrong. Where nothing of that kind is
-found, larger images tell whether one camera is off by some pixels. INPUT is what `limbloc process` takes: a bag, a
+that is late, a camera that was moved (by how much), and one whose masks or lens are wrong. Where nothing of that kind
+is found, larger images tell whether one camera is off by some pixels. INPUT is what `limbloc process` takes: a bag, a
 folder of videos or pictures, silhouettes (--masks), or a benchmark case.
 """
 
