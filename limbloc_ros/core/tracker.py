@@ -46,9 +46,8 @@ class Tracker:
     #: A cost this much above the usual one, or above this many m^2, is no longer believed ...
     DOUBT, DOUBTFUL_COST = 1.35, 4.5e-4
     #: ... but starting anew, which takes as long as many followed frames, is tried only every so many frames: in a
-    #: live room a slow fit makes the next step longer. Each time that starting anew finds
-    #: nothing better, the wait doubles, up to this: some hulls are just bad. Only after a hopeless start the next
-    #: frame is tried.
+    #: live room a slow fit makes the next step longer. Each time that starting anew finds nothing better, the wait
+    #: doubles, up to this: some hulls are just bad. Only after a hopeless start the next frame is tried.
     PATIENCE, LONGEST_WAIT = 8, 32
     #: What is searched when starting anew: less than for a frame alone, for the next frames can mend it.
     SEARCHES = (
