@@ -9,7 +9,7 @@ from figure_poses import fitted_states, pose_of, posed
 
 from limbloc_ros import cli
 from limbloc_ros.commands.report import run_data, with_reference
-from limbloc_ros.core.errors import NoPerson
+from limbloc_ros.core.errors import InputError, NoPerson
 from limbloc_ros.core.figure import FigureState
 from limbloc_ros.core.pose import JOINT, JOINT_NAMES
 from limbloc_ros.export.clip import clip_of
@@ -85,6 +85,22 @@ def test_a_reference_with_other_axes_is_only_moved_when_asked(tmp_path):
     moved = load_reference(tmp_path / "x.npz", run, align="rigid")
     np.testing.assert_allclose(moved.joints, run.joints, atol=1e-9)
     assert "turned by 70.0 degrees" in moved.notes[1]
+
+
+@pytest.mark.parametrize("names", [("RKnee", "LWrist", "Nose"), ("RIGHT_KNEE", "LEFT_WRIST", "NOSE")])
+def test_arrays_of_another_tool_are_known_by_their_shapes(names, tmp_path):
+    """Pose2Sim's and MediaPipe's names; two arrays of that shape would leave open which one it is."""
+    run = walking()
+    places = np.stack([run.joints[:, JOINT["knee_R"]], run.joints[:, JOINT["wrist_L"]], run.joints[:, 0] + 1], axis=1)
+    arrays = {"names": np.array(names), "xyz": places, "confidence": np.ones((len(run), 3))}
+    np.savez(tmp_path / "a.npz", **arrays)
+    reference = load_reference(tmp_path / "a.npz", run)
+    known = np.isfinite(reference.joints).all(axis=(0, 2))
+    assert [JOINT_NAMES[i] for i in np.flatnonzero(known)] == [n for n in JOINT_NAMES if n in ("knee_R", "wrist_L")]
+    np.testing.assert_array_equal(reference.joints[:, known], run.joints[:, known])
+    np.savez(tmp_path / "b.npz", **arrays, raw=places)
+    with pytest.raises(InputError, match="save the arrays under these names"):
+        load_reference(tmp_path / "b.npz", run)
 
 
 def test_another_run_also_brings_its_native_angles(tmp_path):

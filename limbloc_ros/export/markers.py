@@ -37,6 +37,14 @@ MARKER_SETS: Mapping[str, Mapping[str, tuple[str, ...]]] = {
     "limbloc": {name: (name,) for name in JOINT_NAMES},
 }
 
+#: Names of others that are read, not written: MediaPipe Pose's landmarks (its foot index is the big toe's tip).
+_LANDMARKS = {joint.upper(): joint for joint in ("hip", "knee", "ankle", "heel", "shoulder", "elbow", "wrist")}
+_MEDIAPIPE = {
+    f"{side}_{name}": (f"{joint}_{side[0]}",)
+    for side in ("LEFT", "RIGHT")
+    for name, joint in (*_LANDMARKS.items(), ("FOOT_INDEX", "toe"))
+}
+
 
 def marker_places(joints: Array, names: str) -> tuple[tuple[str, ...], Array]:
     """Markers' names and places [F, M, 3] m, from joints [F, 25, 3] m, for a key of MARKER_SETS."""
@@ -46,12 +54,12 @@ def marker_places(joints: Array, names: str) -> tuple[tuple[str, ...], Array]:
 
 
 def joints_of_markers(names: tuple[str, ...], places: Array) -> Array:
-    """The other way: joints [F, 25, 3] m from markers [F, M, 3] of either set of names; NaN for those not there.
+    """The other way: joints [F, 25, 3] m from markers [F, M, 3] of any known names; NaN for those not there.
 
     A joint is taken from the marker that is it alone; the middle of two joints says nothing of either.
     """
     joints = np.full((len(places), len(JOINT_NAMES), 3), np.nan)
-    for markers in MARKER_SETS.values():
+    for markers in (*MARKER_SETS.values(), _MEDIAPIPE):
         for marker, parts in markers.items():
             if marker in names and len(parts) == 1:
                 joints[:, JOINT[parts[0]]] = places[:, names.index(marker)]

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -164,7 +165,7 @@ def _between(a: Array, b: Array) -> Array:
 
 def _from_npz(path: Path) -> tuple[Array, Array | None]:
     arrays = read_npz(path)
-    places, names = joints_of(arrays, path)
+    places, names = joints_of(_under_our_names(arrays), path)
     joints = joints_of_markers(names, places)
     if not np.isfinite(joints).any():
         raise InputError(f"{path}: expected joints such as knee_R, got {', '.join(names[:8])}")
@@ -172,6 +173,20 @@ def _from_npz(path: Path) -> tuple[Array, Array | None]:
     if stamps is not None and (stamps.dtype.kind not in "fiu" or stamps.shape != (len(joints),)):
         raise InputError(f"{path}: expected stamps [{len(joints)}] in s, got {stamps.dtype} {list(stamps.shape)}")
     return joints, None if stamps is None else stamps.astype(np.float64)
+
+
+def _under_our_names(arrays: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """Arrays called otherwise, where only one can be the names and only one the joints: by their shapes."""
+    if "joints" in arrays or "joint_names" in arrays:
+        return arrays
+    pairs = [
+        (joints, names)
+        for names in arrays.values()
+        if names.dtype.kind == "U" and names.ndim == 1
+        for joints in arrays.values()
+        if joints.dtype.kind == "f" and joints.ndim == 3 and joints.shape[1:] == (len(names), 3)
+    ]
+    return {**arrays, "joints": pairs[0][0], "joint_names": pairs[0][1]} if len(pairs) == 1 else arrays
 
 
 def _matching_rows(stamps: Array, times: Array | None, count: int, path: Path) -> tuple[NDArray[np.int64], str]:
