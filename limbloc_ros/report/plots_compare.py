@@ -52,11 +52,11 @@ def error_over_time_and_by_joint(run: RunData) -> Figure:
         axes.annotate(
             "5 cm", (0, CLAIM_MM), xytext=(4, 3), xycoords=("axes fraction", "data"), textcoords="offset points"
         )
-        axes.set_ylim(0, max(60.0, 1.1 * float(np.nanmax(millimetres))))
+        axes.set_ylim(0, max(60.0, 1.22 * float(np.nanmax(millimetres))))  # the legend above the lines
         axes.set_ylabel("distance from the reference (mm)")
         axes.set_xlabel(unit)
         axes.set_title("over time")
-        axes.legend(loc="upper right")
+        axes.legend(loc="upper right", ncols=2)
         by_joint = halves[1].subplots()
         for row, (name, column) in enumerate(zip(limbs, millimetres.T, strict=True)):
             low, start, middle, end, high = np.nanpercentile(column, (5, 25, 50, 75, 95))
