@@ -90,6 +90,7 @@ def soak(live: Live, seconds: float, every_s: float, warm_up_s: float) -> tuple[
             samples.append(Sample(time.monotonic() - began, held, len(answers) / every_s, wrong))
             live.answers.clear()  # or this process itself would grow
             live.cameras.truth.clear()
+            live.cameras.guests.clear()
         restarts = sum(live.graph.restarts.values())
     warm = [s for s in samples if s.at_s > warm_up_s] or samples
     quarter = max(len(warm) // 4, 1)
