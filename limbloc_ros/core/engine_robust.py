@@ -93,7 +93,7 @@ SEEN_WEIGHT = 1e-2
 #: below 2e-4 in the first search, and none of these was wrong where a harder search was right.
 QUICK = Effort(
     torsos=2, leg_pairs=2, starts=3, survivors=2, arm_repairs=1, strict=2, single_arms=2, single_legs=1, rounds=1,
-    finalists=1, candidates=32, enough=2e-4, certain=1.9e-4, shown=False,
+    finalists=1, candidates=32, enough=2e-4, certain=1.6e-4, shown=False,
 )  # fmt: skip
 HARDER = Effort(
     torsos=14, torso_search=search.TorsoSearch(headings=12, listed=3000, compared=200, climbed=60, steps=480),
