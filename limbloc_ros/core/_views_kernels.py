@@ -109,8 +109,9 @@ def draw_parts(
 ) -> tuple[int, int]:
     """Write `mark` to the cells of one camera whose centres the parts cover, but where `drawn` is BODY.
 
-    Another mark that is there already is replaced, or with `alone` both give way to BODY. A part is the convex hull of three balls; here that of the three discs that the balls are seen as, row by row: its
-    outermost points there lie on a disc or on an outer tangent of two.
+    Another mark that is there already is replaced, or with `alone` both give way to BODY. A part is the convex hull of
+    three balls; here that of the three discs that the balls are seen as, row by row: its outermost points there lie on
+    a disc or on an outer tangent of two.
 
     Returns how many of the cells that get this mark are foreground, and background.
     """

@@ -72,6 +72,7 @@ class CarvingNode(Node):
         self.synchroniser: StampSynchroniser[Pixels] | None = None
         self.skipped_s = -BEHIND_S
         Carver.warm_up()
+        cloud_messages.warm_up()
         self.backlog: Backlog[FrameSet[Pixels]] = Backlog(self, self.carve, self.settings.catch_up_s)
         self.hull = self.create_publisher(PointCloud2, topics.HULL, topics.STREAM_QOS)
         s = self.settings

@@ -27,7 +27,7 @@ from limbloc_ros.core.synchroniser import JUMP_S
 from limbloc_ros.ros import messages, node_main, topics
 from limbloc_ros.ros.backlog import Backlog
 from limbloc_ros.ros.body_output import BodiesOutput
-from limbloc_ros.ros.cloud_messages import cloud_to_hull, surface_to_cloud
+from limbloc_ros.ros.cloud_messages import cloud_to_hull, surface_to_cloud, warm_up
 from limbloc_ros.ros.health import SILENT_S, Health, Meter
 from limbloc_ros.ros.messages import NANOSECONDS, OK, WARN, make_status, stamp_ns
 from limbloc_ros.ros.parameters import NodeParameters
@@ -96,6 +96,7 @@ class PoseNode(Node):
         # Before there is anything on the graph: who sees `joints` (a stepped replay) takes the node for ready.
         self.get_logger().info("loading the kernels; the first start compiles them, which may take a minute")
         PoseEstimator.warm_up()
+        warm_up()
         self.joints = self.create_publisher(PoseArray, topics.JOINTS, topics.STREAM_QOS)
         self.angles = self.create_publisher(JointState, topics.JOINT_ANGLES, topics.STREAM_QOS)
         self.markers = self.create_publisher(MarkerArray, topics.MARKERS, topics.STREAM_QOS)

@@ -10,6 +10,7 @@ its bytes and then these, four in each voxel's. An empty cloud says that nobody 
 
 from __future__ import annotations
 
+import functools
 from array import array
 from dataclasses import replace
 from typing import Any
@@ -23,6 +24,7 @@ from limbloc_ros.core.errors import InputError
 from limbloc_ros.core.hull import NOBODY, Hull
 from limbloc_ros.core.surface import Surface
 from limbloc_ros.core.views import Views
+from limbloc_ros.ros import _cloud_kernels as kernels
 
 HULL_POINT = np.dtype(
     {
@@ -99,23 +101,14 @@ def hull_to_cloud(hull: Hull, header: Header) -> PointCloud2:
             f"the hull's voxels have indices {indices.min()} to {indices.max()}; expected -32768 to 32767: "
             "move the world's origin into the room, or use larger voxels"
         )
-    # Columns of four bytes each, which are written three times as fast as the fields of a structured array.
     words = np.empty((len(indices), HULL_POINT.itemsize // 4), np.uint32)
-    numbers = words.view(np.float32)
-    numbers[:, 0:3] = (indices + 0.5) * hull.voxel_m
-    numbers[:, 3] = sdf
-    halves = words.view(np.uint16)
-    halves[:, 8:11] = indices  # modulo 2^16, as int16 has it
-    halves[:, 11] = NOBODY
-    words[:, 6] = round(hull.voxel_m * 1e6)
-    words[:, 7] = round(hull.band_m * 1e6)
-    numbers[:, 8:11] = 0.0
+    cut_by = np.full(len(indices), NOBODY, np.uint8)
     if hull.cut_by is not None and len(hull.viewpoints):
         cut_by = hull.cut_by[hull.sdf < np.float32(hull.band_m)]
-        known = cut_by < len(hull.viewpoints)
-        halves[:, 11] = np.where(known, cut_by, NOBODY)
-        numbers[:, 8:11] = hull.viewpoints[np.where(known, cut_by, 0)]
-    words[:, 11] = 0
+    kernels.write_rows(
+        words, words.view(np.float32), words.view(np.int16), indices, sdf, cut_by, hull.viewpoints, NOBODY,
+        hull.voxel_m, round(hull.voxel_m * 1e6), round(hull.band_m * 1e6),
+    )  # fmt: skip
     if hull.views is not None:
         packed = hull.views.packed
         padded = np.frombuffer(packed + bytes(-len(packed) % 4), "<u4")
@@ -154,31 +147,35 @@ def cloud_to_hull(msg: PointCloud2) -> Hull | None:
         )
     if count == 0:
         return None
-    points = np.frombuffer(msg.data, HULL_POINT)
-    voxel_um, band_um = int(points["voxel_um"][0]), int(points["band_um"][0])
-    if voxel_um == 0 or band_um == 0 or (points["voxel_um"] != voxel_um).any() or (points["band_um"] != band_um).any():
+    words = np.require(np.frombuffer(msg.data, np.uint32).reshape(count, -1), requirements="W")
+    voxel_um, band_um = int(words[0, 6]), int(words[0, 7])
+    indices, sdf, camera, viewpoints, widest, highest, largest, same = kernels.read_rows(
+        words, words.view(np.float32), words.view(np.int16), NOBODY
+    )
+    if voxel_um == 0 or band_um == 0 or not same:
         raise InputError(
             f"a hull has one voxel size and one band above 0; got {voxel_um} um, {band_um} um or a mixture"
         )
     voxel_m, band_m = voxel_um / 1e6, band_um / 1e6
-    sdf = points["sdf"].copy()
-    if not (np.abs(sdf) < 100.0).all() or not (sdf < np.float32(band_m)).all():
+    if not widest < 100.0 or not highest < np.float32(band_m):
         raise InputError(f"signed distances of a hull's cloud must be finite and below the band of {band_m} m")
-    indices = np.stack([points["i"], points["j"], points["k"]], axis=1).astype(np.int32)
-    camera = points["camera"]
-    if (camera > NOBODY).any():
-        raise InputError(f"a hull's cloud numbers cameras up to {NOBODY} (nobody), got {int(camera.max())}")
-    known = camera < NOBODY
-    views = _views(points["views"])
-    if not known.any():
+    if largest > NOBODY:
+        raise InputError(f"a hull's cloud numbers cameras up to {NOBODY} (nobody), got {largest}")
+    views = _views(words[:, 11])
+    if len(viewpoints) == 0:
         return replace(Hull.from_shell(voxel_m, band_m, indices, sdf), views=views)
-    viewpoints = np.zeros((int(camera[known].max()) + 1, 3), np.float32)
-    for axis in range(3):
-        viewpoints[camera[known], axis] = points["vp_" + "xyz"[axis]][known]
     if not np.isfinite(viewpoints).all():
         raise InputError("the places of cameras (vp_x, vp_y, vp_z) in a hull's cloud must be finite")
-    hull = Hull.from_shell(voxel_m, band_m, indices, sdf, cut_by=camera.astype(np.uint8), viewpoints=viewpoints)
+    hull = Hull.from_shell(voxel_m, band_m, indices, sdf, cut_by=camera, viewpoints=viewpoints)
     return replace(hull, views=views)
+
+
+@functools.cache  # once per process
+def warm_up() -> None:
+    """Compile or load the kernels, so that the first cloud is not slow."""
+    sdf = np.full((3, 3, 3), 0.06, np.float32)
+    sdf[1, 1, 1] = -0.01
+    cloud_to_hull(hull_to_cloud(Hull(0.02, (0, 0, 0), sdf, 0.06), Header()))
 
 
 def _views(words: NDArray[np.uint32]) -> Views | None:
