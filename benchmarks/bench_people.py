@@ -8,6 +8,7 @@ row is a scene through the offline run (`temporal`, one process, unless `--alone
 
 - error: mean over head and limb joints of the reliable poses, mm, each person's own; a pose belongs to the true person
   whose trunk is nearest. reliable: share of the frames in which somebody is there and has a reliable pose.
+- wrong: reliable poses of which a limb's joint is more than 15 cm from the truth.
 - exchanged: times that a true person's id changed.
 - phantoms: reliable poses that are further than 0.3 m from everybody, or second ones of the same person.
 - ms: process time of hull and all fits, also those of who has no number yet, per frame, median and mean; rate: one
@@ -45,6 +46,9 @@ Array = NDArray[np.float64]
 
 SCORED = ["head_centre", *(f"{j}_{s}" for j in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle") for s in "LR")]
 ROWS = [JOINT[name] for name in SCORED]
+#: Of the arms and legs; of a reliable pose none may be further off than this, m.
+LIMBS = ROWS[1:]
+WRONG_M = 0.15
 NEAR_M = 0.3
 #: Who is further than this from the middle is not wholly in the carve volume.
 INSIDE_M = 1.25
@@ -77,6 +81,7 @@ class Score:
     errors: list[list[float]] = field(default_factory=list)
     reliable: list[int] = field(default_factory=list)
     present: list[int] = field(default_factory=list)
+    wrong: int = 0
     exchanged: int = 0
     phantoms: int = 0
     last: dict[int, int] = field(default_factory=dict)
@@ -110,13 +115,15 @@ class Score:
             self.exchanged += self.last.get(k, number) != number
             self.last[k] = number
             self.reliable[k] += inside[k]
-            self.errors[k].append(1e3 * float(np.linalg.norm(joints - true, axis=1)[ROWS].mean()))
+            away_m = np.linalg.norm(joints - true, axis=1)
+            self.wrong += bool(away_m[LIMBS].max() > WRONG_M)
+            self.errors[k].append(1e3 * float(away_m[ROWS].mean()))
 
     def text(self) -> str:
-        """Its columns: errors, reliable, exchanged, phantoms."""
+        """Its columns: errors, reliable, wrong, exchanged, phantoms."""
         errors = ", ".join(f"{np.mean(e):.0f}" if e else "-" for e in self.errors)
         share = ", ".join(f"{100 * r / max(p, 1):.0f}" for r, p in zip(self.reliable, self.present, strict=True))
-        return f"{errors} | {share} | {self.exchanged} | {self.phantoms}"
+        return f"{errors} | {share} | {self.wrong} | {self.exchanged} | {self.phantoms}"
 
 
 class Silhouettes:
@@ -246,8 +253,8 @@ def main() -> int:
     offline.prepare(print)
     how = "each frame alone" if args.alone else "temporal"
     print(f"{args.cameras} cameras, {args.seconds:g} s at {args.rate:g} Hz, {how}")
-    print("| scene | error mm | reliable % | exchanged | phantoms | ms median | ms mean | rate |")
-    print("|---|---|---|---|---|---|---|---|")
+    print("| scene | error mm | reliable % | wrong | exchanged | phantoms | ms median | ms mean | rate |")
+    print("|---|---|---|---|---|---|---|---|---|")
     single = float("nan")
     for name, people, together, furnished in SCENES:
         if args.scene and not any(part in name for part in args.scene):
@@ -260,8 +267,8 @@ def main() -> int:
         )
     if args.live:
         print(f"\nlive over DDS, {args.cameras} cameras at {args.live_rate:g} Hz, {args.live:g} s")
-        print("| scene | error mm | reliable % | exchanged | phantoms | answers a second | latency ms |")
-        print("|---|---|---|---|---|---|---|")
+        print("| scene | error mm | reliable % | wrong | exchanged | phantoms | answers a second | latency ms |")
+        print("|---|---|---|---|---|---|---|---|")
         for people, together in ((1, "apart"), (2, "crossing"), (3, "crossing"), (3, "touching")):
             score, rate, latency = score_live(people, together, args)
             print(f"| {people} {together} | {score.text()} | {rate:.1f} | {latency:.0f} |", flush=True)
