@@ -62,6 +62,7 @@ CORE_ORDER = (
     "tracker",
     "joint_angles",
     "ros4hri",
+    "posture",
     "unexplained",
     "shown",
     "confidence",

@@ -27,6 +27,7 @@ from limbloc_ros.core.hull import Hull, components
 from limbloc_ros.core.people import People
 from limbloc_ros.core.pipeline import Carver, PoseEstimator
 from limbloc_ros.core.pose import JOINT, Pose
+from limbloc_ros.core.posture import POSTURES
 from limbloc_ros.core.ros4hri import ros4hri
 from limbloc_ros.nodes.carving import CarvingNode
 from limbloc_ros.nodes.pose import PoseNode
@@ -284,7 +285,15 @@ class IdsList:
     ids: list[str] = field(default_factory=list)
 
 
-def test_tf_and_the_list_of_bodies_where_they_exist(
+@dataclass
+class BodyPosture:
+    """Stand-in for hri_msgs/BodyPosture."""
+
+    header: Header
+    posture: int = 0
+
+
+def test_tf_posture_and_the_list_of_bodies_where_they_exist(
     graph: Graph, hull: Hull, offline: Pose, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sent: list[Any] = []
@@ -293,6 +302,9 @@ def test_tf_and_the_list_of_bodies_where_they_exist(
     node = graph.add(PoseNode)
     tracked: list[IdsList] = []
     node.bodies._ids_list, node.bodies._tracked = IdsList, types.SimpleNamespace(publish=tracked.append)
+    (body,) = node.bodies._outputs.values()
+    postures: list[BodyPosture] = []
+    body._body_posture, body._posture = BodyPosture, types.SimpleNamespace(publish=postures.append)
     node.estimator.estimate = lambda *_: offline
     descriptions = graph.collect(String, "humans/bodies/p1/urdf", topics.LATCHED_QOS)
     carvings = Carvings(graph)
@@ -300,6 +312,7 @@ def test_tf_and_the_list_of_bodies_where_they_exist(
     node.estimator.estimate = lambda *_: NoPerson("gone")
     carvings.send(hull, 1)
     assert [message.ids for message in tracked] == [["p1"], []]
+    assert [message.posture for message in postures] == [POSTURES.index("standing")]
     graph.until(lambda: len(descriptions) == 1)
     root, *links = sent
     assert (root.header.frame_id, root.child_frame_id) == ("room", "body_p1")

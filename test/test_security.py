@@ -21,7 +21,7 @@ from limbloc_ros.nodes.composed import KINDS, flatten
 from limbloc_ros.nodes.foxglove_bridge import FoxgloveBridge
 from limbloc_ros.nodes.graph_plan import config_from_mapping, load_config, plan_graph
 from limbloc_ros.ros import transforms
-from limbloc_ros.ros.body_output import import_ids_list
+from limbloc_ros.ros.body_output import hri_message
 from limbloc_ros.ros.environment import NetworkConfig, graph_environment
 from limbloc_ros.ros.security import BACKGROUND_SET, OPERATOR, PARAMETERS_SET, policy
 from limbloc_ros.ros.supervisor import ENCLAVES
@@ -32,7 +32,7 @@ FOLDERS = ("limbloc_ros", "launch", "tools", "examples", "fuzz")
 #: Allowed, but not on the graph of the simulated room: message packages that are not installed here, and people who
 #: are not there.
 SELDOM = {
-    "/lab/humans/bodies/tracked" if import_ids_list() is None else "",
+    *({"/lab/humans/bodies/tracked", "/lab/humans/bodies/*/posture"} if hri_message("IdsList") is None else ()),
     "/lab/true_joints_*",
     *({"/tf", "/tf_static"} if transforms.import_tf_message() is None else ()),
 }

@@ -6,7 +6,7 @@
 
 RUN is the folder that `limbloc process` wrote, FILES holds what `limbloc export RUN --format bvh gltf c3d` made of it.
 BVH and glTF are imported by Blender with its defaults (z up, y away from the viewer: a quarter turn of our world), C3D
-by py-c3d. Nothing of this package is imported.
+by py-c3d. Of this package only the reader of joints.npz is imported (PYTHONPATH=. is enough).
 """
 
 from __future__ import annotations
@@ -16,6 +16,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from limbloc_ros.recordings.npz_file import read_npz
 
 #: Bone -> the joint at which it begins. Blender has none where a chain ends in an end site.
 HEADS = {
@@ -31,8 +33,8 @@ HEADS = {
 
 def load_run(run: Path) -> tuple[np.ndarray, list[str], np.ndarray]:
     """Joints [F, 25, 3] m, their names, stamps [F] s."""
-    with np.load(run / "joints.npz") as data:
-        return data["joints"], [str(name) for name in data["joint_names"]], data["stamps"]
+    data = read_npz(run / "joints.npz")
+    return data["joints"], [str(name) for name in data["joint_names"]], data["stamps"]
 
 
 def blender_places(path: Path, seconds: np.ndarray) -> np.ndarray:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""People as ROS4HRI wants them (REP-155): joint_states, a URDF with the fitted lengths, the list of ids, and TF.
+"""People as ROS4HRI wants them (REP-155): joint_states, a URDF with the fitted lengths, postures, ids, and TF.
 
 `roi`, `cropped` and `skeleton2d` belong to one camera's image and have no meaning for many: they are left out.
 """
@@ -17,6 +17,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Header, String
 
 from limbloc_ros.core.pose import Pose
+from limbloc_ros.core.posture import POSTURES, posture_of
 from limbloc_ros.core.ros4hri import ros4hri
 from limbloc_ros.ros import topics
 from limbloc_ros.ros.messages import (
@@ -50,7 +51,7 @@ class BodiesOutput:
     def __init__(self, node: Node, first_id: str, publish_tf: str) -> None:
         self._node, self._first_id, self._publish_tf = node, first_id, publish_tf
         self._transforms = TransformOutput(node) if publish_tf != "none" else None
-        self._ids_list = import_ids_list()
+        self._ids_list = hri_message("IdsList")
         if self._ids_list is not None:
             self._tracked = node.create_publisher(self._ids_list, topics.BODIES_TRACKED, topics.STREAM_QOS)
         self._outputs: dict[int, BodyOutput] = {}
@@ -104,6 +105,9 @@ class BodyOutput:
         self._states = node.create_publisher(JointState, topics.body_joint_states(body_id), topics.STREAM_QOS)
         self._urdf = node.create_publisher(String, topics.body_urdf(body_id), topics.LATCHED_QOS)
         self._native_urdf = node.create_publisher(String, topics.body_native_urdf(body_id), topics.LATCHED_QOS)
+        self._body_posture = hri_message("BodyPosture")
+        if self._body_posture is not None:
+            self._posture = node.create_publisher(self._body_posture, topics.body_posture(body_id), topics.STREAM_QOS)
         self._description = ""
         self._sizes: Mapping[str, float] = {}
         self._described_ns = 0
@@ -129,6 +133,8 @@ class BodyOutput:
         self._angles = ros4hri(pose, self._angles)
         states = angles_to_message(self._angles, header, f"_{self._id}")
         self._states.publish(states)
+        if self._body_posture is not None:
+            self._posture.publish(self._body_posture(header=header, posture=POSTURES.index(posture_of(pose.joints))))
         if self._transforms is not None and self._transforms.available:
             frames = [transform_to_message(body_pose(pose), topics.body_frame(self._id), header)]
             if self._publish_tf == "all":
@@ -138,13 +144,13 @@ class BodyOutput:
             self._transforms.send(frames)
 
 
-def import_ids_list() -> Any | None:
-    """The message hri_msgs/IdsList, or None where there is none: it comes with an apt ROS 2 only."""
+def hri_message(name: str) -> Any | None:
+    """A message of hri_msgs, or None where there is none: it comes with an apt ROS 2 only."""
     try:
-        from hri_msgs.msg import IdsList
+        import hri_msgs.msg
     except ImportError:
         return None
-    return IdsList
+    return getattr(hri_msgs.msg, name, None)
 
 
 def body_pose(pose: Pose) -> NDArray[np.float64]:

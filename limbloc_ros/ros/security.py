@@ -33,7 +33,7 @@ _BODIES = tuple(
     of("*")
     for of in (
         *(topics.body_joints, topics.body_joint_angles, topics.body_joint_states),
-        *(topics.body_urdf, topics.body_native_urdf),
+        *(topics.body_urdf, topics.body_native_urdf, topics.body_posture),
     )
 )
 _RESULTS = (

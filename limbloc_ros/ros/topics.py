@@ -104,6 +104,11 @@ def body_joint_angles(body_id: str) -> str:
     return f"humans/bodies/{body_id}/joint_angles"
 
 
+def body_posture(body_id: str) -> str:
+    """Standing, sitting, ...: hri_msgs/BodyPosture, where hri_msgs is installed."""
+    return f"humans/bodies/{body_id}/posture"
+
+
 def body_frame(body_id: str) -> str:
     """TF frame of a person: mid-hips, x forward, z to the head."""
     return f"body_{body_id}"
