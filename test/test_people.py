@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 
 from limbloc_ros.core import hull as hulls
-from limbloc_ros.core.confidence import CUT_M2
+from limbloc_ros.core.confidence import CUT_M2, DOUBTFUL
 from limbloc_ros.core.config import FitConfig, HullConfig
 from limbloc_ros.core.errors import InputError, NoPerson
 from limbloc_ros.core.figure import FigureState
 from limbloc_ros.core.hull import NOBODY, Hull, components, largest_component
 from limbloc_ros.core.joint_angles import ContinuousAngles
 from limbloc_ros.core.parts import Part, Sight, candidates, divide
-from limbloc_ros.core.people import FORGET_S, PERSON, People
+from limbloc_ros.core.people import FORGET_S, PERSON, TOUCHING_DOUBTFUL, People
 from limbloc_ros.core.pipeline import Carver, PoseEstimator
 from limbloc_ros.core.pose import JOINT, Pose
 from limbloc_ros.recordings.offline import OfflineConfig, process
@@ -312,6 +312,27 @@ def test_two_who_touch_keep_their_bodies_apart() -> None:
     assert sorted(owner.values()) == [0, 1]
     assert np.median(errors) < 0.06, np.round(errors, 3)
     assert np.mean(errors) < 0.09
+
+
+def test_who_touches_somebody_is_trusted_with_less_doubt_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A shared part is cut by where the figures should be: an arm of one may have gone to the other."""
+    risk = 0.5 * (TOUCHING_DOUBTFUL + DOUBTFUL)
+    somebody()  # is fitted once, for real
+
+    def fit(_: PoseEstimator, hull: Hull, others: tuple = ()) -> Pose:
+        centre = Part.of(hull).centre
+        return dataclasses.replace(at(centre[0], centre[1])[1], risk=risk)
+
+    monkeypatch.setattr(PoseEstimator, "estimate", fit)
+    stage, people, seen = room(2, "touching"), People(FitConfig(temporal=True)), set()
+    for t in np.arange(5.2, 7.0, 0.2):
+        sight = people.look(carved(stage, float(t)))
+        bodies = people.follow(sight, round(t * 1e9))
+        if len(bodies) == 2:
+            seen |= {(len(sight.parts), body.outcome.reliable, body.outcome.doubt) for body in bodies}
+    assert seen == {(2, True, ""), (1, False, "somebody else touches this person")}
+    risk = 0.5 * TOUCHING_DOUBTFUL
+    assert all(body.outcome.reliable for body in people.follow(sight, round(7e9)))
 
 
 def test_who_comes_in_is_searched_when_wholly_there(monkeypatch: pytest.MonkeyPatch) -> None:
