@@ -156,10 +156,14 @@ def blind_spots(coverage: Coverage, floor: float = 0.5) -> list[str]:
         (i0, j0), (i1, j1) = at.min(axis=0), at.max(axis=0)
         least = [int(counts[inside].min()) for counts in coverage.counts]
         part = ("at the ankles", "at the waist", "with raised hands")[int(np.argmin(least))]
-        out.append(
-            f"{area:.1f} m2 between x {coverage.x[i0]:.1f} and {coverage.x[i1]:.1f}, y {coverage.y[j0]:.1f} and "
-            f"{coverage.y[j1]:.1f} m: down to {min(least)} cameras {part} (needed: {coverage.needed})"
-        )
+        last = np.array(inside.shape) - 1
+        if i0 == j0 == 0 and i1 == last[0] and j1 == last[1]:
+            inwards = (np.minimum(at, last - at).min(axis=1).max() + 1) * STEP_M
+            where = f"along all sides, up to {inwards:.1f} m inwards"
+        else:
+            where = f"between x {coverage.x[i0]:.1f} and {coverage.x[i1]:.1f}, y {coverage.y[j0]:.1f} and "
+            where += f"{coverage.y[j1]:.1f} m"
+        out.append(f"{area:.1f} m2 {where}: down to {min(least)} cameras {part} (needed: {coverage.needed})")
     return out
 
 
