@@ -18,7 +18,7 @@ from limbloc_ros.core.figure import FigureState
 from limbloc_ros.core.hull import NOBODY, Hull, components, largest_component
 from limbloc_ros.core.joint_angles import ContinuousAngles
 from limbloc_ros.core.parts import Part, Sight, candidates, divide
-from limbloc_ros.core.people import FORGET_S, PERSON, TOUCHING_DOUBTFUL, People
+from limbloc_ros.core.people import COMPANY_DOUBTFUL, FORGET_S, PERSON, TOUCHING_DOUBTFUL, People
 from limbloc_ros.core.pipeline import Carver, PoseEstimator
 from limbloc_ros.core.pose import JOINT, Pose
 from limbloc_ros.recordings.offline import OfflineConfig, process
@@ -316,7 +316,7 @@ def test_two_who_touch_keep_their_bodies_apart() -> None:
 
 def test_who_touches_somebody_is_trusted_with_less_doubt_only(monkeypatch: pytest.MonkeyPatch) -> None:
     """A shared part is cut by where the figures should be: an arm of one may have gone to the other."""
-    risk = 0.5 * (TOUCHING_DOUBTFUL + DOUBTFUL)
+    risk = 0.5 * (TOUCHING_DOUBTFUL + COMPANY_DOUBTFUL)
     somebody()  # is fitted once, for real
 
     def fit(_: PoseEstimator, hull: Hull, others: tuple = ()) -> Pose:
@@ -333,6 +333,10 @@ def test_who_touches_somebody_is_trusted_with_less_doubt_only(monkeypatch: pytes
     assert seen == {(2, True, ""), (1, False, "somebody else touches this person")}
     risk = 0.5 * TOUCHING_DOUBTFUL
     assert all(body.outcome.reliable for body in people.follow(sight, round(7e9)))
+    risk, sight = 0.5 * (COMPANY_DOUBTFUL + DOUBTFUL), people.look(carved(room(2, "apart"), 7.5))
+    people.reset()
+    assert len(sight.parts) == 2
+    assert not any(body.outcome.reliable for body in people.follow(sight, 0))
 
 
 def test_who_comes_in_is_searched_when_wholly_there(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -65,10 +65,11 @@ DOUBT_S = 10.0
 FASTEST_M_S, HORIZON_S = 2.5, 0.5
 #: A figure that is that likely wrong need not be a person; one with an arm in the wrong place still is.
 NOBODY = 0.5
-#: A figure of a part that several share is only trusted when it is less likely wrong than this: the part was cut apart
-#: by guess, and an arm of one may have gone to the other. (Of 164 poses of people who touched, 11 of the 42 wrong ones
-#: were below the usual bound, none below 0.09; of 122 right ones 58 and 45.)
-TOUCHING_DOUBTFUL = 0.06
+#: With somebody or something else in the room a figure is only trusted when it is less likely wrong than this, for they
+#: hide each other, and there is less to judge by. Less still when several share a part, which was cut apart by guess: an
+#: arm of one may have gone to the other. (Of people who touched, 11 of 42 wrong poses were below the usual bound and
+#: none below 0.09; of 122 right ones 58, and 45 below 0.06. Of two who crossed at 2.5 Hz, one of one and 96 of 96.)
+COMPANY_DOUBTFUL, TOUCHING_DOUBTFUL = 0.09, 0.06
 #: Statures of people, m.
 STATURES_M = (0.8, 2.3)
 
@@ -162,12 +163,13 @@ class _Track:
             self.trusted_ns = stamp_ns
         self.score = min(max(self.score, 0) + 1, PERSON) if good else max(min(self.score, 0) - 1, FURNITURE)
 
-    def trusted(self) -> Pose | NoPerson:
-        """The outcome of the last fit; it is not relied on where it was doubtful and somebody else touches."""
-        pose = self.outcome
-        if self.shared and isinstance(pose, Pose) and pose.reliable and pose.risk >= TOUCHING_DOUBTFUL:
-            return replace(pose, reliable=False, doubt="somebody else touches this person")
-        return pose
+    def trusted(self, company: bool) -> Pose | NoPerson:
+        """The outcome of the last fit, not relied on where it is doubtful in company."""
+        pose, bound = self.outcome, TOUCHING_DOUBTFUL if self.shared else COMPANY_DOUBTFUL
+        if not company or isinstance(pose, NoPerson) or not pose.reliable or pose.risk < bound:
+            return pose
+        what = "touches this person" if self.shared else "is there, and this figure somewhat in doubt"
+        return replace(pose, reliable=False, doubt=f"somebody else {what}")
 
     def rests(self, stamp_ns: int) -> bool:
         """Furniture need not be looked at in every frame."""
@@ -227,10 +229,8 @@ class People:
         )
         if isinstance(sight, NoPerson) or not sight.parts:
             sight = Sight((), list)
-        if len(self._tracks) <= 1 and len(sight.parts) <= 1:
-            taken = self._follow_one(sight, stamp_ns)
-        else:
-            taken = self._follow_many(sight, stamp_ns)
+        company = len(self._tracks) > 1 or len(sight.parts) > 1
+        taken = self._follow_many(sight, stamp_ns) if company else self._follow_one(sight, stamp_ns)
         self._appoint(stamp_ns)
         shown = [track for track in self._tracks if track.number or track is self._alone]
         bodies = []
@@ -239,7 +239,7 @@ class People:
         for track in sorted(shown, key=lambda track: (track.shown_ns, track.number)):
             outcome: Pose | NoPerson = NoPerson(reason if not sight.parts else "no part of the hull is this person")
             if any(track is other for other in taken):
-                outcome = track.trusted()
+                outcome = track.trusted(company)
                 if self._consecutive:
                     outcome = track.angles.follow(outcome, stamp_ns)
             bodies.append(Body(track.number or 1, outcome))
