@@ -65,10 +65,11 @@ DOUBT_S = 10.0
 FASTEST_M_S, HORIZON_S = 2.5, 0.5
 #: A figure that is that likely wrong need not be a person; one with an arm in the wrong place still is.
 NOBODY = 0.5
-#: With somebody or something else in the room a figure is only trusted when it is less likely wrong than this, for they
-#: hide each other, and there is less to judge by. Less still when several share a part, which was cut apart by guess: an
-#: arm of one may have gone to the other. (Of people who touched, 11 of 42 wrong poses were below the usual bound and
-#: none below 0.09; of 122 right ones 58, and 45 below 0.06. Of two who crossed at 2.5 Hz, one of one and 96 of 96.)
+#: With somebody or something else in the room a figure is only trusted when it is less likely wrong than this, for
+#: they hide each other, and there is less to judge by. Less still when several share a part, which was cut apart by
+#: guess: an arm of one may have gone to the other. (Of people who touched, 11 of 42 wrong poses were below the usual
+#: bound and none below 0.09; of 122 right ones 58, and 45 below 0.06. Of two who crossed at 2.5 Hz, one of one wrong
+#: pose was between 0.09 and the usual bound, and none of 96 right ones.)
 COMPANY_DOUBTFUL, TOUCHING_DOUBTFUL = 0.09, 0.06
 #: Statures of people, m.
 STATURES_M = (0.8, 2.3)
