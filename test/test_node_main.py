@@ -69,6 +69,20 @@ def test_a_signal_while_modules_are_imported_ends_the_process_quietly(command: s
     assert (ended.returncode, ended.stdout, ended.stderr) == (0, "", "")
 
 
+def test_a_node_that_is_compiled_for_long_is_not_waited_for() -> None:
+    """A signal waits until the compiler has been left, but not for ever."""
+    script = """
+import os, signal, sys
+from limbloc_ros.ros import node_main
+node_main.LATE_S = 0.3
+compiler = {"__name__": "numba.core.compiler"}
+exec('def compiled():\\n import os, signal, time\\n os.kill(os.getpid(), signal.SIGINT)\\n time.sleep(20)', compiler)
+sys.exit(node_main.main(compiler["compiled"], args=[]))
+"""
+    ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=15, check=False)
+    assert (ended.returncode, ended.stderr) == (0, "")
+
+
 INTERRUPTED = "os.kill(os.getpid(), signal.SIGINT)"
 
 

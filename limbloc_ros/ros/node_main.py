@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import gc
+import os
 import signal
 import time
 from collections.abc import Callable, Sequence
@@ -24,6 +25,8 @@ from limbloc_ros.core.interrupts import interrupt
 REFUSED = 2
 #: Exit code when what it did came to an end before its time, which it has told; starting again would not help either.
 ENDED = 3
+#: A node that is still being compiled so long after a signal, s, is not waited for: `ros2 launch` kills after ten.
+LATE_S = 3.0
 
 
 def make_executor(context: Context | None = None) -> Executor:
@@ -104,11 +107,15 @@ def main(
     nodes: Sequence[Node] = ()
     code = 0
     making = stopped = False
+    stopped_s = 0.0
 
     def on_signal(number: int, frame: FrameType | None) -> None:
-        nonlocal stopped
-        stopped = True
+        nonlocal stopped, stopped_s
+        if not stopped:
+            stopped, stopped_s = True, time.monotonic()
         if making:  # a start that compiles kernels takes a while; nobody wants to wait for its end
+            if time.monotonic() - stopped_s > LATE_S:  # the signal comes again and again until the compiler is left
+                os._exit(0)
             interrupt(number, frame)
 
     def make() -> Sequence[Node]:
