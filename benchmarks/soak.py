@@ -27,6 +27,8 @@ from faults.processes import Footprint, footprint, left_behind
 
 #: The person is in the room this long, and then away this long, s.
 STAYS_S, AWAY_S = 40.0, 8.0
+#: Instants whose truth is kept, for the poses that are still on their way.
+REMEMBERED = 200
 #: Growth of memory that is allowed, and loss of rate.
 GROWTH, SLOWER = 0.02, 0.05
 
@@ -89,8 +91,7 @@ def soak(live: Live, seconds: float, every_s: float, warm_up_s: float) -> tuple[
             wrong = sum(a.wrong for a in answers)
             samples.append(Sample(time.monotonic() - began, held, len(answers) / every_s, wrong))
             live.answers.clear()  # or this process itself would grow
-            live.cameras.truth.clear()
-            live.cameras.guests.clear()
+            live.cameras.forget_all_but(REMEMBERED)
         restarts = sum(live.graph.restarts.values())
     warm = [s for s in samples if s.at_s > warm_up_s] or samples
     quarter = max(len(warm) // 4, 1)

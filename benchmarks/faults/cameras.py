@@ -86,6 +86,13 @@ class Cameras:
             header = make_header(shot.stamp_ns, topics.optical_frame(shot.camera))
             self._publishers[shot.camera].publish(pixels_to_image(shot.pixels, header))
 
+    def forget_all_but(self, last: int) -> None:
+        """Keep only what is known of the last instants."""
+        for known in (self.truth, self.guests):
+            for stamp in list(known)[:-last]:
+                del known[stamp]
+        del self.filmed_s[:-last]
+
     def _film(self, now: float) -> None:
         wall_ns = time.time_ns()
         images, joints = self.stage.shoot(self.period_s, wall_ns / NANOSECONDS)
