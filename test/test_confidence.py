@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from limbloc_ros.core import confidence
-from limbloc_ros.core.confidence import DOUBTFUL, risk_of
+from limbloc_ros.core.confidence import DOUBTFUL, SURE, WARY_FRAMES, Wariness, risk_of
 from limbloc_ros.core.figure import FigureState, place
 from limbloc_ros.core.hull import Hull
+from limbloc_ros.core.pose import Pose
 
 BODY = place(FigureState.standing(np.array([0.0, 0.0, 0.95]))).flesh()
 SHOWN = np.array([[0.16, 0.26, 0.65], [0.16, 0.26, 0.65]])
@@ -59,9 +60,9 @@ def test_a_leg_that_hardly_shows_is_named(side):
 
 
 def test_what_the_figure_has_not_is_told_with_its_distance():
-    assert "something 18 cm beside the figure" in asked(passed_m=0.18)
-    assert asked(passed_m=0.17) == ""
-    assert "something 17 cm beside the figure" in asked(passed_m=0.17, shown=0.4 * SHOWN)
+    assert "something 16 cm beside the figure" in asked(passed_m=0.16)
+    assert asked(passed_m=0.15) == ""
+    assert "something 15 cm beside the figure" in asked(passed_m=0.15, shown=0.5 * SHOWN)
     assert risk_of(block(), BODY, 0.3, None, 0.2)[0] == 1.0
 
 
@@ -85,3 +86,32 @@ def test_a_figure_of_no_such_hull_and_half_a_person():
     cut = block()
     cut.sdf[-2, 3:-3, 3:-3] = -0.05  # up to the wall, and outside beyond it
     assert "carve volume" in asked(hull=dataclasses.replace(cut, sdf=cut.sdf))
+
+
+def test_a_followed_figure_that_was_doubted_must_be_clearly_right_for_some_frames():
+    nothing = np.zeros(1)
+    fit = Pose(
+        BODY.centres[:25],
+        np.zeros((1, 3, 3)),
+        ("pelvis",),
+        {},
+        {},
+        BODY,
+        nothing,
+        0.2,
+        np.zeros(25),
+        True,
+        {},
+        risk=0.05,
+    )
+    doubted = dataclasses.replace(fit, reliable=False, risk=0.5, doubt="why")
+    clear = dataclasses.replace(fit, risk=0.5 * SURE)
+    wary = Wariness()
+    assert wary.judge(fit) is fit
+    assert wary.judge(doubted) is doubted
+    assert wary.judge(clear) is clear
+    told = wary.judge(fit)
+    assert not told.reliable and "in doubt just before" in told.doubt and told.risk == fit.risk
+    for _ in range(WARY_FRAMES - 2):
+        wary.judge(clear)
+    assert wary.judge(fit) is fit

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from limbloc_ros.core import engine_paper, engine_robust
 from limbloc_ros.core.camera import Camera, Rig
-from limbloc_ros.core.confidence import describe_pose
+from limbloc_ros.core.confidence import Wariness, describe_pose
 from limbloc_ros.core.config import FitConfig, HullConfig, validated
 from limbloc_ros.core.errors import NoPerson
 from limbloc_ros.core.hull import Hull, carve_silhouettes, largest_component
@@ -66,7 +66,7 @@ class PoseEstimator:
 
     def __init__(self, config: FitConfig | None = None) -> None:
         self.config = validated(config or FitConfig())
-        self._tracker = Tracker(self.config.seed)
+        self._tracker, self._wariness = Tracker(self.config.seed), Wariness()
 
     def estimate(self, hull: Hull, others: Sequence[Flesh] = ()) -> Pose | NoPerson:
         """Fit the figure to one hull; of a hull in several parts to the largest.
@@ -96,11 +96,13 @@ class PoseEstimator:
         clock.lap("fit")
         if fit is None:
             return NoPerson("the hull holds nothing that a torso fits into")
-        return describe_pose(fit.state, hull, fit.system, clock.stage_ms, fit.rivals, surface, others)
+        pose = describe_pose(fit.state, hull, fit.system, clock.stage_ms, fit.rivals, surface, others)
+        return self._wariness.judge(pose) if self.config.temporal else pose
 
     def reset(self) -> None:
         """Forget the last frame (a new recording, a jump back in time)."""
         self._tracker.reset()
+        self._wariness = Wariness()
 
     @staticmethod
     @functools.cache
