@@ -346,6 +346,8 @@ def main() -> int:
     parser.add_argument("--only", choices=parts, action="append", help="only this part; may be repeated")
     args = parser.parse_args()
     parts = tuple(args.only or parts)
+    if args.plots is not None:
+        args.plots.mkdir(parents=True, exist_ok=True)  # not after minutes of work
     offline.prepare(lambda text: print(text, file=sys.stderr))
     neighbours, rates = measuring.Neighbours(), measured_rates()
     print(f"{measuring.machine()}; {args.frames} frames of each setting, ms")
