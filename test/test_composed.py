@@ -20,7 +20,7 @@ from sensor_msgs.msg import Image
 from limbloc_ros.core.errors import ConfigError
 from limbloc_ros.nodes import composed
 from limbloc_ros.recordings.bags import BagWriter
-from limbloc_ros.ros.node_main import ENDED
+from limbloc_ros.ros.exit_codes import ENDED
 
 
 @pytest.fixture

@@ -26,7 +26,7 @@ from limbloc_ros.nodes.composed import KINDS, flatten
 from limbloc_ros.nodes.graph_plan import NODE_SECTIONS, SmartSpaceConfig, load_config, plan_graph
 from limbloc_ros.rig.rig_file import load_rig
 from limbloc_ros.ros.environment import graph_environment, share_folder
-from limbloc_ros.ros.supervisor import REFUSED
+from limbloc_ros.ros.exit_codes import REFUSED
 
 ROOT = Path(limbloc_ros.__file__).parent.parent
 LAUNCH = ROOT / "launch" / "smart_space.launch.py"

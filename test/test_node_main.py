@@ -13,7 +13,7 @@ from geometry_msgs.msg import PoseArray
 from ros_graph import DOMAIN, Graph
 
 from limbloc_ros.ros import topics
-from limbloc_ros.ros.node_main import REFUSED
+from limbloc_ros.ros.exit_codes import REFUSED
 
 
 def start(*parameters: str) -> subprocess.Popen[str]:

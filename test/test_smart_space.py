@@ -29,10 +29,9 @@ from limbloc_ros.rig.rig_file import load_rig, save_rig
 from limbloc_ros.ros import shared_memory
 from limbloc_ros.ros import supervisor as supervising
 from limbloc_ros.ros.environment import NetworkConfig, config_file, graph_environment
+from limbloc_ros.ros.exit_codes import ENDED, REFUSED
 from limbloc_ros.ros.process_starter import ProcessStarter, StartedProcess
 from limbloc_ros.ros.supervisor import (
-    ENDED,
-    REFUSED,
     SETTLED_S,
     End,
     ProcessConfig,

@@ -33,7 +33,7 @@ from rclpy.utilities import remove_ros_args
 from limbloc_ros.core.errors import ConfigError
 from limbloc_ros.rig.plain_values import yaml_values
 from limbloc_ros.ros import node_main
-from limbloc_ros.ros.node_main import ENDED, REFUSED
+from limbloc_ros.ros.exit_codes import ENDED, REFUSED
 
 #: Node classes by kind; their modules are imported when asked for, because each brings its own libraries.
 KINDS = {

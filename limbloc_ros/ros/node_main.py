@@ -20,11 +20,8 @@ from rclpy.signals import SignalHandlerOptions
 
 from limbloc_ros.core.errors import LimblocError
 from limbloc_ros.core.interrupts import interrupt
+from limbloc_ros.ros.exit_codes import REFUSED
 
-#: Exit code when a node refused its parameters or input: starting again would not help.
-REFUSED = 2
-#: Exit code when what it did came to an end before its time, which it has told; starting again would not help either.
-ENDED = 3
 #: A node that is still being compiled so long after a signal, s, is not waited for: `ros2 launch` kills after ten.
 LATE_S = 3.0
 

@@ -21,6 +21,7 @@ from types import FrameType
 from typing import IO, Any
 
 from limbloc_ros.core.config import setting
+from limbloc_ros.ros.exit_codes import ENDED, REFUSED
 from limbloc_ros.ros.process_starter import SERVER, ProcessStarter, StartedProcess
 from limbloc_ros.ros.shared_memory import remove_abandoned
 
@@ -31,10 +32,6 @@ SETTLED_S = 30.0
 ABANDONED_MB = 64
 #: SROS2 enclaves of the processes lie below this path; see docs/how_to/security.md.
 ENCLAVES = "/limbloc"
-#: Exit code of `nodes.composed` when a node refused its parameters or input.
-REFUSED = 2
-#: Exit code of `nodes.composed` when it could not go on, which is no reason for the others to end: a full disk.
-ENDED = 3
 
 
 @dataclass(frozen=True)
