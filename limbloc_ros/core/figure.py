@@ -120,15 +120,29 @@ def proportions() -> Proportions:
 
 
 def _shift_joints(bone_offsets: Array, point_bones: list[int], point_offsets: Array) -> None:
-    """Move pivots and joints as the topology says, in place; flesh stays where it is while nothing is bent."""
+    """Move pivots and joints as the topology says, in place; flesh stays where it is while nothing is bent.
+
+    The two bones of a limb have their pivots on one line, from which all angles are counted. So where a pivot inside a
+    limb moves across that line, the flesh around it moves the other way instead.
+    """
+    unmoved = bone_offsets[:, :, 0].copy()
+    carriers = np.array(point_bones)
+    marks_pivot = (np.arange(len(carriers)) >= N_SPHERES) & ~point_offsets.any(axis=(1, 2))
     for name, shift in PIVOT_SHIFTS.items():
+        bone, parent = BONE[name], int(PARENTS[BONE[name]])
         d = np.array(shift) / REFERENCE_STATURE_M
-        bone_offsets[BONE[name], :, 0] += d
-        bone_offsets[[child for child in range(N_BONES) if PARENTS[child] == BONE[name]], :, 0] -= d
-        for n, bone in enumerate(point_bones):
-            marks_pivot = n >= N_SPHERES and not point_offsets[n].any()
-            if bone == BONE[name] and not marks_pivot:
-                point_offsets[n, :, 0] -= d
+        along, across = d * (0.0, 0.0, 1.0), d * (1.0, 1.0, 0.0)
+        within_limb = bool(np.allclose(unmoved[bone, :2], 0.0, atol=1e-6))
+        bone_offsets[bone, :, 0] += along if within_limb else d
+        nexts = np.flatnonzero(PARENTS == bone)
+        bone_offsets[nexts, :, 0] -= along
+        # Flesh between two pivots follows both of them, by how near they are.
+        for n in np.flatnonzero((carriers == bone) & ~marks_pivot):
+            share = 1.0 - np.clip(point_offsets[n, 2, 0] / unmoved[nexts[0], 2], 0.0, 1.0) if len(nexts) else 1.0
+            point_offsets[n, :, 0] -= along + share * across
+        if within_limb:
+            for n in np.flatnonzero((carriers == parent) & ~marks_pivot):
+                point_offsets[n, :, 0] -= np.clip(point_offsets[n, 2, 0] / unmoved[bone, 2], 0.0, 1.0) * across
     for name, shift in JOINT_SHIFTS.items():
         point_offsets[N_SPHERES + JOINT_NAMES.index(name), :, 0] += np.array(shift) / REFERENCE_STATURE_M
 
