@@ -134,7 +134,7 @@ def _shift_joints(bone_offsets: Array, point_bones: list[int], point_offsets: Ar
         along, across = d * (0.0, 0.0, 1.0), d * (1.0, 1.0, 0.0)
         within_limb = bool(np.allclose(unmoved[bone, :2], 0.0, atol=1e-6))
         bone_offsets[bone, :, 0] += along if within_limb else d
-        nexts = np.flatnonzero(PARENTS == bone)
+        nexts = [child for child in range(N_BONES) if PARENTS[child] == bone]
         bone_offsets[nexts, :, 0] -= along
         # Flesh between two pivots follows both of them, by how near they are.
         for n in np.flatnonzero((carriers == bone) & ~marks_pivot):
