@@ -4,6 +4,7 @@
 import dataclasses
 from functools import cache
 
+import cv2
 import numpy as np
 import pytest
 from camera_rings import LENSES, ball_masks, ring
@@ -148,6 +149,21 @@ def test_nobody_is_asked_about_ignored_regions():
     assert back.cells.tobytes() == hull.views.cells.tobytes()
 
 
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.55, 1.0])
+def test_only_blobs_that_hold_a_marked_cell_stay(share):
+    """As OpenCV labels them, with cells that nobody asks about in between, which stay as they are."""
+    rng = np.random.default_rng(int(10 * share))
+    image = np.uint8(rng.random((30, 41)) < share)
+    image[rng.random(image.shape) < 0.05] = kernels.UNASKED
+    marks = np.uint8(rng.random(image.shape) < 0.02)
+    _, blobs = cv2.connectedComponents(np.uint8(image == kernels.SEEN), connectivity=8)
+    stays = np.isin(blobs, np.setdiff1d(blobs[marks > 0], 0))
+    expected = np.where(image == kernels.UNASKED, image, np.where(stays, kernels.SEEN, kernels.BARE))
+    x, y, width, height = cv2.boundingRect(np.uint8(stays))
+    assert kernels.keep_held(image, marks) == (x, x + width, y, y + height)
+    np.testing.assert_array_equal(image, expected)
+
+
 def test_discs_between_two_rows_cover_nothing():
     """Neither they nor the way between them meets the centre of a cell; one part lies across a row, one does not."""
     frames, cells = np.array([[0, 0, 8, 8, 1, 0]]), np.zeros(64, np.uint8)
@@ -176,6 +192,12 @@ def test_a_hull_has_no_views_that_cannot_be_sent(monkeypatch):
     hull = carve(masks, rig, HullConfig(min_voxels=1))
     assert isinstance(hull, Hull)
     assert hull.views is None
+
+
+def test_they_fit_where_their_packed_bytes_do():
+    views = one_ball()
+    size = len(views.packed)
+    assert [views.fits(room) for room in (0, size - 1, size, size + 1, 100 * size)] == [False, False, True, True, True]
 
 
 def test_packed_and_unpacked_they_are_the_same():

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from limbloc_ros.core._projection_kernels import project, row_start
+from limbloc_ros.core._projection_kernels import project, project_block, row_start
+from limbloc_ros.core._union_kernels import join, root
 
 #: In cells: background, foreground, and what nobody is asked about.
 BARE, SEEN, UNASKED = 0, 1, 2
@@ -23,32 +24,84 @@ FAR = 1e6
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def sample_cells(field: Any, boxes: Any, frames: Any, cells: Any) -> None:
-    """Fill cells (uint8, laid out as `frames` [C, 6] says) with whether the distance field is negative at each one's
-    centre; what lies beyond a camera's piece of the field is background."""
+    """Set to SEEN the cells (uint8, laid out as `frames` [C, 6] says) at whose centres the distance field is negative;
+    what lies beyond a camera's piece of the field is background, and stays as it is."""
     for c in range(len(frames)):
         left, top, width, height, step, offset = frames[c]
         x0, y0, columns, rows, begin = boxes[c]
+        left, top = left + step // 2 - x0, top + step // 2 - y0  # the first cell's centre, in the piece
+        first = max(0, -(left // step))
+        last = min(width, (columns - 1 - left) // step + 1)
         for j in range(height):
-            y = top + j * step + step // 2 - y0
-            for i in range(width):
-                x = left + i * step + step // 2 - x0
-                inside = x >= 0 and y >= 0 and x < columns and y < rows and field[begin + y * columns + x] < 0.0
-                cells[offset + j * width + i] = SEEN if inside else BARE
+            y = top + j * step
+            if y < 0 or y >= rows:
+                continue
+            row = field[begin + y * columns : begin + (y + 1) * columns]
+            marks = cells[offset + j * width : offset + (j + 1) * width]
+            for i in range(first, last):
+                marks[i] = SEEN if row[left + i * step] < 0.0 else BARE
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def mark_points(points: Any, cams: Any, frames: Any, marks: Any) -> None:
-    """Set to 1 the cells in which points [P, 3] m are seen."""
+    """Set to 1 the cells in which points [3, P] m are seen."""
+    seen = np.empty((3, points.shape[1]))
     for c in range(len(frames)):
         left, top, width, height, step, offset = frames[c]
-        for n in range(len(points)):
-            u, v, depth = project(cams, c, row_start(cams, c, points[n, 0], points[n, 1]), points[n, 2])
-            if depth <= 0.0:
-                continue
-            i = math.floor((u + 0.5 - left) / step)
-            j = math.floor((v + 0.5 - top) / step)
-            if i >= 0 and j >= 0 and i < width and j < height:
+        project_block(cams, c, points, seen)
+        for n in range(points.shape[1]):
+            i = math.floor((seen[0, n] + 0.5 - left) / step)
+            j = math.floor((seen[1, n] + 0.5 - top) / step)
+            if seen[2, n] > 0.0 and i >= 0 and j >= 0 and i < width and j < height:
                 marks[offset + j * width + i] = 1
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def keep_held(image: Any, marks: Any) -> tuple[int, int, int, int]:
+    """Of the blobs (8-connected) of SEEN cells of an image [height, width] only those stay that hold a marked cell.
+
+    Returns the first and the last (exclusive) column and row of what stays; four times 0 of nothing.
+
+    Blobs are put together from runs of cells in a row, each of which knows an earlier one of its blob.
+    """
+    height, width = image.shape
+    room = height * (width + 1) // 2
+    runs = np.empty((room, 3), np.int32)  # row, first and last (exclusive) column
+    parent = np.empty(room, np.int32)
+    held = np.zeros(room, np.bool_)
+    count, before = 0, 0  # `before`: the first run of the row above
+    for y in range(height):
+        row, above = count, before
+        x = 0
+        while x < width:
+            if image[y, x] != SEEN:
+                x += 1
+                continue
+            runs[count, 0], runs[count, 1] = y, x
+            parent[count] = count
+            while x < width and image[y, x] == SEEN:
+                held[count] |= marks[y, x] != 0
+                x += 1
+            runs[count, 2] = x
+            while above < row and runs[above, 2] < runs[count, 1]:
+                above += 1
+            touching = above
+            while touching < row and runs[touching, 1] <= x:
+                join(parent, touching, count)
+                touching += 1
+            count += 1
+        before = row
+    left, right, top, bottom = width, 0, height, 0
+    for n in range(count):
+        if held[n]:
+            held[root(parent, n)] = True
+    for n in range(count):
+        y, first, last = runs[n]
+        if held[root(parent, n)]:
+            left, right, top, bottom = min(left, first), max(right, last), min(top, y), max(bottom, y + 1)
+        else:
+            image[y, first:last] = BARE
+    return (left, right, top, bottom) if right > 0 else (0, 0, 0, 0)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]

@@ -8,12 +8,12 @@ that it and the silhouette do not share is measured: eq. 2 of the paper, in the 
 
 from __future__ import annotations
 
+import math
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -62,49 +62,42 @@ class Views:
         cameras = silhouettes.cameras
         frames = np.zeros((len(cameras), 6), np.int64)
         middle = points.mean(axis=0)
+        depths = cameras[:, 6:9] @ middle + cameras[:, 11]
         count = 0
-        for c, (x, y, width, height, _) in enumerate(silhouettes.counts.frames):
-            depth = max(0.5, float(cameras[c, 6:9] @ middle + cameras[c, 11]))
-            step = max(1, round(CELL_M * cameras[c, 12] / depth))
-            margin = int(np.ceil(MARGIN_M * cameras[c, 12] / depth))
-            left, top = max(0, int(x) - margin), max(0, int(y) - margin)
-            right = min(int(cameras[c, 31]), int(x + width) + margin)
-            bottom = min(int(cameras[c, 32]), int(y + height) + margin)
-            frames[c] = left, top, max(0, right - left) // step, max(0, bottom - top) // step, step, count
-            count += int(frames[c, 2] * frames[c, 3])
-        cells = np.empty(count, np.uint8)
+        for c, (x, y, width, height, _) in enumerate(silhouettes.counts.frames.tolist()):
+            depth, focal = max(0.5, float(depths[c])), float(cameras[c, 12])
+            step, margin = max(1, round(CELL_M * focal / depth)), math.ceil(MARGIN_M * focal / depth)
+            left, top = max(0, x - margin), max(0, y - margin)
+            right = min(int(cameras[c, 31]), x + width + margin)
+            bottom = min(int(cameras[c, 32]), y + height + margin)
+            columns, rows = max(0, right - left) // step, max(0, bottom - top) // step
+            frames[c] = left, top, columns, rows, step, count
+            count += columns * rows
+        cells, marks = np.zeros((2, count), np.uint8)
         kernels.sample_cells(silhouettes.field, silhouettes.boxes, frames, cells)
-        marks = np.zeros(count, np.uint8)
-        kernels.mark_points(points, cameras, frames, marks)
-        images = zip(frames, silhouettes.ignored, _images(frames, cells), _images(frames, marks), strict=True)
+        kernels.mark_points(np.ascontiguousarray(points.T), cameras, frames, marks)
+        boxes = []
+        images = zip(frames.tolist(), silhouettes.ignored, _images(frames, cells), _images(frames, marks), strict=True)
         for (left, top, _, _, step, _), ignored, image, held in images:
-            if not image.size:
-                continue
-            unasked = np.zeros(image.shape, np.bool_)
-            if ignored is not None:  # foreground, for the hull's sake
-                rows, columns = (
+            if image.size and ignored is not None:  # foreground, for the hull's sake
+                at = (
                     first + step // 2 + step * np.arange(n) for first, n in zip((top, left), image.shape, strict=True)
                 )
-                unasked = ignored[np.ix_(rows, columns)] > 0
-                image[unasked] = kernels.BARE
-            _, blobs = cv2.connectedComponents(image, connectivity=8)
-            kept = np.zeros(int(blobs.max()) + 1, np.uint8)
-            kept[blobs[held > 0]] = kernels.SEEN
-            kept[0] = kernels.BARE
-            image[:] = np.where(unasked, np.uint8(kernels.UNASKED), kept[blobs])
-        return Views(cameras, frames, cells)._cropped()
+                image[ignored[np.ix_(*at)] > 0] = kernels.UNASKED
+            boxes.append(kernels.keep_held(image, held))
+        return Views(cameras, frames, cells)._cropped(boxes)
 
-    def _cropped(self) -> Views:
-        """The same with no more than a margin around each silhouette."""
+    def _cropped(self, boxes: Sequence[tuple[int, int, int, int]]) -> Views:
+        """The same with no more than a margin around each silhouette, which lies in a box: first and last (exclusive)
+        column and row."""
         frames, images = self.frames.copy(), []
+        margin = round(MARGIN_M / CELL_M)
         count = 0
-        for frame, image in zip(frames, _images(self.frames, self.cells), strict=True):
-            x, y, width, height = cv2.boundingRect(np.uint8(image == kernels.SEEN)) if image.size else (0, 0, 0, 0)
-            margin = round(MARGIN_M / CELL_M)
-            left, top = max(0, x - margin), max(0, y - margin)
-            part = image[top : y + height + margin, left : x + width + margin] if width else image[:0, :0]
-            frame[0] += left * frame[4]
-            frame[1] += top * frame[4]
+        for frame, image, (x0, x1, y0, y1) in zip(frames, _images(self.frames, self.cells), boxes, strict=True):
+            left, top = max(0, x0 - margin), max(0, y0 - margin)
+            part = image[top : y1 + margin, left : x1 + margin] if x1 else image[:0, :0]
+            step = int(frame[4])
+            frame[:4] += left * step, top * step, 0, 0
             frame[2], frame[3], frame[5] = part.shape[1], part.shape[0], count
             count += part.size
             images.append(part.ravel())
@@ -128,8 +121,11 @@ class Views:
 
     def fits(self, room: int) -> bool:
         """Whether these views can be sent in so many bytes."""
-        few = len(self.cameras) <= MOST_CAMERAS and len(self.cells) <= MOST_CELLS
-        return few and len(self.packed) <= room
+        if len(self.cameras) > MOST_CAMERAS or len(self.cells) > MOST_CELLS:
+            return False
+        loose = 8 * (self.cameras.size + self.frames.size) + len(self.cells) // 4 + 100
+        # What cannot be compressed at all grows by an eighth at most: mostly there is room for that anyway.
+        return 9 * loose <= 8 * room or len(self.packed) <= room
 
     @staticmethod
     def unpacked(data: bytes) -> Views:
