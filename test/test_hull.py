@@ -107,6 +107,16 @@ def test_largest_component_drops_the_rest_and_its_shell():
     np.testing.assert_array_equal(kept.sdf, alone.sdf)
 
 
+@pytest.mark.parametrize("share", [0.0, 0.2, 0.35, 1.0])
+def test_parts_are_numbered_in_the_order_of_their_first_voxels(share):
+    solid = np.random.default_rng(3).random((9, 7, 12)) < share
+    labels, sizes, boxes = hulls.kernels.label_components(np.where(solid, 0.01, 0.03), 0.02)
+    np.testing.assert_array_equal(labels, ndimage.label(solid)[0])
+    np.testing.assert_array_equal(sizes[1:], np.bincount(labels.ravel())[1:])
+    expected = [[[side.start for side in box], [side.stop for side in box]] for box in ndimage.find_objects(labels)]
+    assert boxes[1:].tolist() == expected
+
+
 @pytest.mark.parametrize("reach", [0, 1, 3, 9])
 def test_parts_grow_along_all_axes(reach):
     part = np.random.default_rng(reach).random((7, 1, 13)) < 0.03

@@ -71,7 +71,7 @@ def test_everybody_has_a_part_of_the_hull_and_phantoms_have_none(monkeypatch: py
 
 def test_parts_are_what_a_search_over_the_whole_grid_gives() -> None:
     hull = carved(room(3, "apart"), 7.5)
-    labels, sizes = hulls._label(hull)
+    labels, sizes, _ = hulls._parts(hull)
     assert len(sizes) == 4
     reach = int(np.ceil(hull.band_m / hull.voxel_m))
     for part, label in zip(components(hull), np.argsort(-sizes[1:]) + 1, strict=True):

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,7 +81,7 @@ class Hull:
     @property
     def inside_count(self) -> int:
         """Number of voxels inside."""
-        return int((self.sdf < 0).sum())
+        return int(np.count_nonzero(self.sdf < 0))
 
     @property
     def cut_area_m2(self) -> float:
@@ -243,9 +244,9 @@ def carve_silhouettes(silhouettes: Silhouettes, rig: Rig, config: HullConfig) ->
     inside = indices[distance < 0]
     every = max(1, len(inside) // VIEW_POINTS)
     views = Views.of(mended, (inside[::every] + 0.5) * config.voxel_m)
-    labels, sizes = _label(hull)
-    if len(sizes) > 2:
-        hull = _with_labels(hull, labels, _people_among(hull, labels, sizes, silhouettes, config))
+    parts = _parts(hull)
+    if len(parts.sizes) > 2:
+        hull = _with_parts(hull, parts, _people_among(hull, parts, silhouettes, config))
     if hull.inside_count * (config.voxel_m / 0.02) ** 3 < config.min_voxels:
         return NoPerson(f"the hull has only {hull.inside_count} voxels of {config.voxel_m} m: too small for a person")
     # They travel with the hull's voxels, a word each but for the first (see `ros.cloud_messages`); only of tiny hulls
@@ -256,38 +257,50 @@ def carve_silhouettes(silhouettes: Silhouettes, rig: Rig, config: HullConfig) ->
 
 def largest_component(hull: Hull) -> Hull:
     """The hull with only its largest connected part and the shell around it; bridges gaps of about two voxels."""
-    labels, sizes = _label(hull)
-    return hull if len(sizes) <= 2 else _with_labels(hull, labels, [int(sizes[1:].argmax()) + 1])
+    parts = _parts(hull)
+    return hull if len(parts.sizes) <= 2 else _with_parts(hull, parts, [int(parts.sizes[1:].argmax()) + 1])
 
 
 def components(hull: Hull) -> list[Hull]:
     """Every connected part of the hull as a hull of its own, the largest first; the hull itself if it is in one."""
-    labels, sizes = _label(hull)
-    if len(sizes) <= 2:
+    parts = _parts(hull)
+    if len(parts.sizes) <= 2:
         return [hull]
-    order = np.argsort(-sizes[1:], kind="stable") + 1
-    return [_with_labels(hull, labels, [int(label)]) for label in order]
+    order = np.argsort(-parts.sizes[1:], kind="stable") + 1
+    return [_with_parts(hull, parts, [int(label)]) for label in order]
 
 
-def _label(hull: Hull) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
-    """Which connected part each voxel belongs to (0: none), and how large they are (from 1 on)."""
-    return kernels.label_components(hull.sdf < np.float32(hull.voxel_m))  # type: ignore[no-any-return]
+class _Parts(NamedTuple):
+    """The connected parts of a hull, numbered from 1 on.
+
+    Attributes:
+        labels: int32 [nx, ny, nz] which part each voxel belongs to; 0: none.
+        sizes: int64 [L + 1] how many voxels each has.
+        boxes: int64 [L + 1, 2, 3] lowest and highest (exclusive) indices of each in the grid.
+    """
+
+    labels: NDArray[np.int32]
+    sizes: NDArray[np.int64]
+    boxes: NDArray[np.int64]
 
 
-def _people_among(
-    hull: Hull, labels: NDArray[np.int32], sizes: NDArray[np.int64], silhouettes: Silhouettes, config: HullConfig
-) -> list[int]:
+def _parts(hull: Hull) -> _Parts:
+    return _Parts(*kernels.label_components(hull.sdf, np.float32(hull.voxel_m)))
+
+
+def _people_among(hull: Hull, hull_parts: _Parts, silhouettes: Silhouettes, config: HullConfig) -> list[int]:
     """The parts of the hull that may be people: the largest, and others that are large enough and no phantoms.
 
     Where the silhouettes of several people cross there may be volume that nobody fills (a phantom). All of it hides
     before or behind somebody in every camera: it covers hardly a pixel that another part does not cover as well. Of
     the parts of which that is true the one with the least to itself goes, and the others are asked again.
     """
-    inside = np.bincount(labels[hull.sdf < 0], minlength=len(sizes))
+    sizes = hull_parts.sizes
+    inside = np.bincount(hull_parts.labels[hull.sdf < 0], minlength=len(sizes))
     large = inside * (config.voxel_m / 0.02) ** 3 >= config.min_further_voxels
     large[0], large[int(sizes[1:].argmax()) + 1] = False, True
     parts = [int(label) for label in np.flatnonzero(large)]
-    covers = [_cover(hull, labels, label, silhouettes) for label in parts] if len(parts) > 1 else []
+    covers = [_cover(hull, hull_parts, label, silhouettes) for label in parts] if len(parts) > 1 else []
     while len(parts) > 1:
         total: NDArray[np.uint8] = np.stack(covers).sum(axis=0, dtype=np.uint8)
         alone = [_share_alone(cover, total, silhouettes) for cover in covers]
@@ -298,14 +311,15 @@ def _people_among(
     return parts
 
 
-def _cover(hull: Hull, labels: NDArray[np.int32], label: int, silhouettes: Silhouettes) -> NDArray[np.uint8]:
+def _cover(hull: Hull, parts: _Parts, label: int, silhouettes: Silhouettes) -> NDArray[np.uint8]:
     """Which pixels of all silhouettes a part of the hull covers; uint8 in the layout of `silhouettes.field`.
 
     One voxel of eight stands for all: this is asked for every part of every frame with several people.
     """
-    hull, labels = _around(hull, labels, [label], 0)
-    local = np.stack(np.nonzero(((labels == label) & (hull.sdf < 0))[::2, ::2, ::2])) * 2
-    centres = (local + np.asarray(hull.index_min)[:, None] + 0.5) * hull.voxel_m
+    low, high = parts.boxes[label]
+    cut = tuple(slice(a, b, 2) for a, b in zip(low.tolist(), high.tolist(), strict=True))
+    local = np.stack(np.nonzero((parts.labels[cut] == label) & (hull.sdf[cut] < 0))) * 2
+    centres = (local + (hull.index_min + low)[:, None] + 0.5) * hull.voxel_m
     covered = np.zeros(silhouettes.field.size, np.uint8)
     mending_kernels.cover(
         np.ascontiguousarray(centres), 1.75 * hull.voxel_m, silhouettes.cameras, silhouettes.boxes, covered
@@ -322,41 +336,13 @@ def _share_alone(cover: NDArray[np.uint8], total: NDArray[np.uint8], silhouettes
     return float(np.sort(shares)[-min(2, len(shares))])
 
 
-def _with_labels(hull: Hull, labels: NDArray[np.int32], keep: list[int]) -> Hull:
+def _with_parts(hull: Hull, parts: _Parts, keep: list[int]) -> Hull:
     """The hull with only some of its connected parts and the shell around them."""
-    reach = math.ceil(hull.band_m / hull.voxel_m)
-    hull, labels = _around(hull, labels, keep, reach + 1)
-    part = labels == keep[0] if len(keep) == 1 else np.isin(labels, keep)
-    near = kernels.grow_part(part, reach)
-    kept = near & ((labels == 0) | part)
-    sdf = np.where(kept, hull.sdf, np.float32(hull.band_m))
-    cut_by = None if hull.cut_by is None else np.where(kept, hull.cut_by, np.uint8(NOBODY))
-    return _cropped(replace(hull, sdf=sdf, cut_by=cut_by))
-
-
-def _around(hull: Hull, labels: NDArray[np.int32], keep: list[int], margin: int) -> tuple[Hull, NDArray[np.int32]]:
-    """Hull and labels cut to the box around some parts with a margin of so many voxels."""
-    kept = np.zeros(int(labels.max()) + 1, np.bool_)
-    kept[keep] = True
-    low, high = kernels.label_box(labels, kept)
-    low, high = np.maximum(low - margin, 0), np.minimum(high + margin, labels.shape)
-    cut = tuple(slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
-    i, j, k = (int(a + b) for a, b in zip(hull.index_min, low, strict=True))
-    cut_by = None if hull.cut_by is None else hull.cut_by[cut]
-    return replace(hull, index_min=(i, j, k), sdf=hull.sdf[cut], cut_by=cut_by), labels[cut]
-
-
-def _cropped(hull: Hull) -> Hull:
-    """The hull without its empty borders, as `from_shell` makes it."""
-    used = hull.sdf < np.float32(hull.band_m)
-    slices = []
-    for axis in range(3):
-        others = tuple(a for a in range(3) if a != axis)
-        at = np.flatnonzero(used.any(axis=others))
-        slices.append(slice(int(at[0]) - 1, int(at[-1]) + 2))
-    i, j, k = (low + cut.start for low, cut in zip(hull.index_min, slices, strict=True))
-    sdf = np.ascontiguousarray(hull.sdf[tuple(slices)])
-    cut_by = None if hull.cut_by is None else np.ascontiguousarray(hull.cut_by[tuple(slices)])
+    band, reach = np.float32(hull.band_m), math.ceil(hull.band_m / hull.voxel_m)
+    stays, corner = kernels.parts_and_shell(hull.sdf, band, parts.labels, parts.boxes, np.array(keep), reach)
+    i, j, k = (low + int(first) for low, first in zip(hull.index_min, corner, strict=True))
+    sdf = kernels.copy_where(hull.sdf, corner, stays, band)
+    cut_by = None if hull.cut_by is None else kernels.copy_where(hull.cut_by, corner, stays, np.uint8(NOBODY))
     return replace(hull, index_min=(i, j, k), sdf=sdf, cut_by=cut_by)
 
 
