@@ -278,6 +278,17 @@ def evaluate_blocks(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def count_denied(first: Any, second: Any, who: Any, cameras: int) -> tuple[int, Any]:
+    """How many voxels no camera denies, and how many each camera alone does; int64 [cameras]."""
+    kept: Any = 0
+    denied = np.zeros(cameras, np.int64)
+    for n in range(len(first)):
+        kept += first[n] < 0.0
+        denied[who[n]] += (first[n] >= 0.0) & (second[n] < 0.0)
+    return kept, denied
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def replace_voxels(voxels: Any, dropped: Any, new: Any) -> Any:
     """Those of the voxels (as `evaluate_blocks` gives them) that are not dropped (bool [V]), then the new ones."""
     count = len(dropped) - np.count_nonzero(dropped)

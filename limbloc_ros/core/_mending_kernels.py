@@ -86,25 +86,58 @@ def count_bare(field: Any, covered: Any, boxes: Any, inner_px: float) -> Any:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def centres_inside(indices: Any, first: Any, voxel: float) -> Any:
+    """Centres [3, P] m of the voxels (`indices` [V, 3]) whose largest distance `first` [V] is negative."""
+    count = 0
+    for n in range(len(first)):
+        count += first[n] < 0.0
+    centres = np.empty((3, count))
+    at = 0
+    for n in range(len(first)):
+        if first[n] < 0.0:
+            for axis in range(3):
+                centres[axis, at] = (indices[n, axis] + 0.5) * voxel
+            at += 1
+    return centres
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def denied_by_one(voxels: Any, limit: Any, voxel: float) -> tuple[Any, Any, Any]:
+    """Of the voxels (as `evaluate_blocks` gives them) that one camera alone denies and that lie further than `limit`
+    (negative) inside for the next: centres [3, P] m, that camera int16 [P], and how deep they lie there float32 [P] m.
+    """
+    indices, first, second, who = voxels
+    chosen = np.empty(len(first), np.int64)
+    count = 0
+    for n in range(len(first)):
+        chosen[count] = n
+        count += (first[n] >= 0.0) & (second[n] < limit)
+    centres, deniers, depths = np.empty((3, count)), np.empty(count, np.int16), np.empty(count, np.float32)
+    for at in range(count):
+        n = chosen[at]
+        for axis in range(3):
+            centres[axis, at] = (indices[n, axis] + 0.5) * voxel
+        deniers[at], depths[at] = who[n], -second[n]
+    return centres, deniers, depths
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def count_unexplained(
     points: Any, deniers: Any, cams: Any, boxes: Any, field: Any, covered: Any, inner_px: float
 ) -> Any:
-    """In how many cameras but the denier each point falls on foreground that nothing covers; int16 [V]."""
-    out = np.zeros(len(points), np.int16)
-    for n in range(len(points)):
-        for c in range(len(cams)):
-            if c == deniers[n]:
+    """In how many cameras but the denier each point [3, P] falls on foreground that nothing covers; int16 [P]."""
+    out = np.zeros(points.shape[1], np.int16)
+    seen = np.empty((3, points.shape[1]))
+    for c in range(len(cams)):
+        left, top, width, height, offset = boxes[c]
+        project_block(cams, c, points, seen)
+        for n in range(points.shape[1]):
+            x = math.floor(seen[0, n] + 0.5) - left
+            y = math.floor(seen[1, n] + 0.5) - top
+            if seen[2, n] <= 0.0 or c == deniers[n] or x < 0 or y < 0 or x >= width or y >= height:
                 continue
-            u, v, depth = project(cams, c, row_start(cams, c, points[n, 0], points[n, 1]), points[n, 2])
-            if depth <= 0.0:
-                continue
-            x = math.floor(u + 0.5) - boxes[c, 0]
-            y = math.floor(v + 0.5) - boxes[c, 1]
-            if x < 0 or y < 0 or x >= boxes[c, 2] or y >= boxes[c, 3]:
-                continue
-            at = boxes[c, 4] + y * boxes[c, 2] + x
-            if field[at] < -inner_px and covered[at] == 0:
-                out[n] += 1
+            at = offset + y * width + x
+            out[n] += (field[at] < -inner_px) & (covered[at] == 0)
     return out
 
 

@@ -191,8 +191,7 @@ def evaluate_live(silhouettes: Silhouettes, config: HullConfig) -> tuple[Silhoue
         _, first, second, who = voxels
         if len(silhouettes.names) <= max(config.min_cameras, 3):
             return silhouettes, voxels
-        kept = np.count_nonzero(first < 0)
-        denied = np.bincount(who[(first >= 0) & (second < 0)], minlength=len(silhouettes.names))
+        kept, denied = kernels.count_denied(first, second, who, len(silhouettes.names))
         worst = int(denied.argmax())
         others = np.delete(denied, worst)
         if denied[worst] < 2 * kept + config.min_voxels or denied[worst] < 2 * others.max():
@@ -241,9 +240,9 @@ def carve_silhouettes(silhouettes: Silhouettes, rig: Rig, config: HullConfig) ->
         who,
         np.stack([rig.camera(name).T_world_camera[:3, 3] for name in silhouettes.names]).astype(np.float32),
     )
-    inside = indices[distance < 0]
+    inside = np.flatnonzero(distance < 0)
     every = max(1, len(inside) // VIEW_POINTS)
-    views = Views.of(mended, (inside[::every] + 0.5) * config.voxel_m)
+    views = Views.of(mended, (indices[inside[::every]] + 0.5) * config.voxel_m)
     parts = _parts(hull)
     if len(parts.sizes) > 2:
         hull = _with_parts(hull, parts, _people_among(hull, parts, silhouettes, config))

@@ -31,7 +31,7 @@ def cover_silhouettes(silhouettes: Silhouettes, voxels: Voxels, config: HullConf
     """Which pixels the hull's voxels project to, or are to be ignored; uint8 in the layout of `silhouettes.field`."""
     indices, first, _, _ = voxels
     covered = np.zeros(silhouettes.field.size, np.uint8)
-    centres = (np.ascontiguousarray(indices[first < 0].T) + 0.5) * config.voxel_m
+    centres = kernels.centres_inside(indices, first, config.voxel_m)
     kernels.cover(centres, 0.875 * config.voxel_m, silhouettes.cameras, silhouettes.boxes, covered)
     for (x, y, width, height, offset), ignored in zip(silhouettes.boxes, silhouettes.ignored, strict=True):
         if ignored is not None:
@@ -65,21 +65,20 @@ def mend_silhouettes(
     Returns:
         silhouettes with the mended ones measured anew, or the very same object when nothing was to mend.
     """
-    indices, first, second, who = voxels
     if len(silhouettes.names) < 3:
         return silhouettes
     half = 0.5 * config.voxel_m
-    denied = (first >= 0) & (second < np.float32(-0.25 * half))
-    if not denied.any():
+    points, deniers, depths = kernels.denied_by_one(voxels, np.float32(-0.25 * half), config.voxel_m)
+    if len(deniers) == 0:
         return silhouettes
     table = (silhouettes.cameras, silhouettes.boxes)
-    points, deniers, depths = (indices[denied] + 0.5) * config.voxel_m, who[denied], -second[denied]
     unexplained = kernels.count_unexplained(points, deniers, *table, silhouettes.field, covered, INNER_PX)
     # Few cameras leave a hull so fat that depth says little: four of them gain 12 % phantom volume from clean masks,
     # a third from ragged ones.
     deep = depths > (config.repair_depth_m if len(silhouettes.names) >= ENOUGH_CAMERAS else np.inf)
-    give_back = (unexplained >= 2) | deep
-    return _painted(silhouettes, points[give_back], np.maximum(depths[give_back], half), deniers[give_back])
+    give_back = np.flatnonzero((unexplained >= 2) | deep)
+    centres = np.ascontiguousarray(points[:, give_back].T)
+    return _painted(silhouettes, centres, np.maximum(depths[give_back], half), deniers[give_back])
 
 
 def mend_twice_denied(

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -42,31 +42,38 @@ class PixelCounts:
     @staticmethod
     def of(pieces: Iterable[tuple[NDArray[np.uint8], int, int]]) -> PixelCounts:
         """Count the ones of the smallest piece [height, width] around them of every image; its first column and row."""
-        parts = []
-        for piece, x, y in pieces:
-            sums = cv2.integral(piece).ravel() if piece.size else np.zeros(0, np.int32)
-            height, width = piece.shape if piece.size else (0, 0)
-            parts.append(((x, y, width, height), sums))
-        return PixelCounts._joined(parts)
+        pieces = list(pieces)
+        counts = PixelCounts._empty(
+            [(x, y, *piece.shape[::-1]) if piece.size else (x, y, 0, 0) for piece, x, y in pieces]
+        )
+        for c, (piece, _, _) in enumerate(pieces):
+            if piece.size:
+                cv2.integral(piece, counts._table(c), cv2.CV_32S)  # into it
+        return counts
 
     def pick(self, cameras: Iterable[int], replaced: Mapping[int, PixelCounts] | None = None) -> PixelCounts:
         """The same of some camera numbers, those of `replaced` with the first camera's counts there."""
-        parts = []
-        for c in cameras:
-            source, row = (self, c) if replaced is None or c not in replaced else (replaced[c], 0)
-            x, y, width, height, offset = (int(n) for n in source.frames[row])
-            size = (width + 1) * (height + 1) if width else 0
-            parts.append(((x, y, width, height), source.sums[offset : offset + size]))
-        return PixelCounts._joined(parts)
+        sources = [(self, c) if replaced is None or c not in replaced else (replaced[c], 0) for c in cameras]
+        picked = PixelCounts._empty([source.frames[row, :4].tolist() for source, row in sources])
+        for c, (source, row) in enumerate(sources):
+            picked._table(c)[:] = source._table(row)
+        return picked
 
     @staticmethod
-    def _joined(parts: list[tuple[tuple[int, int, int, int], NDArray[np.int32]]]) -> PixelCounts:
-        frames = np.zeros((len(parts), 5), np.int64)
+    def _empty(rectangles: Sequence[Sequence[int]]) -> PixelCounts:
+        """For x0, y0, width, height of each camera, nothing counted yet."""
+        frames = np.zeros((len(rectangles), 5), np.int64)
         offset = 0
-        for c, (frame, sums) in enumerate(parts):
-            frames[c] = *frame, offset
-            offset += sums.size
-        return PixelCounts(frames, np.concatenate([sums for _, sums in parts] or [np.zeros(0, np.int32)]))
+        for c, (x, y, width, height) in enumerate(rectangles):
+            frames[c] = x, y, width, height, offset
+            offset += (width + 1) * (height + 1) if width else 0
+        return PixelCounts(frames, np.empty(offset, np.int32))
+
+    def _table(self, c: int) -> NDArray[np.int32]:
+        """The sums [height + 1, width + 1] of camera number c; [0, 0] where nothing is to be counted."""
+        _, _, width, height, offset = self.frames[c].tolist()
+        rows, columns = (height + 1, width + 1) if width else (0, 0)
+        return self.sums[offset : offset + rows * columns].reshape(rows, columns)
 
 
 @dataclass(frozen=True)
@@ -107,7 +114,7 @@ class Silhouettes:
 
     def piece(self, c: int) -> NDArray[np.float32]:
         """[height, width] the stored piece of camera number c, px."""
-        _, _, width, height, offset = self.boxes[c]
+        _, _, width, height, offset = self.boxes[c].tolist()
         return self.field[offset : offset + width * height].reshape(height, width)
 
     def whole_mask(self, c: int) -> NDArray[np.uint8]:
@@ -122,7 +129,7 @@ class Silhouettes:
         Returns:
             the part [height, width], 0 or 1, and its first column and row.
         """
-        x, y, width, height, _ = (int(n) for n in self.counts.frames[c])
+        x, y, width, height, _ = self.counts.frames[c].tolist()
         left, top, right, bottom = min(left, x), min(top, y), max(right, x + width), max(bottom, y + height)
         part = np.zeros((bottom - top, right - left), np.uint8)
         part[y - top : y - top + height, x - left : x - left + width] = self.masks[c]
@@ -159,7 +166,7 @@ class Silhouettes:
         """How many foreground pixels of each image, up to a pixel, were none before."""
         gained = []
         for c, mask in enumerate(self.masks):
-            x, y, width, height, _ = (int(n) for n in self.counts.frames[c])
+            x, y, width, height, _ = self.counts.frames[c].tolist()
             if mask is before.masks[c]:
                 gained.append((mask[:0], x, y))
                 continue
@@ -175,11 +182,11 @@ class Silhouettes:
         """
         changed = []
         for c, mask in enumerate(self.masks):
-            x, y, width, height, _ = (int(n) for n in self.boxes[c])
+            x, y, width, height, _ = self.boxes[c].tolist()
             if mask is before.masks[c]:
                 changed.append((np.zeros((0, 0), np.uint8), x, y))
                 continue
-            x_old, y_old, width_old, height_old, _ = before.boxes[c]
+            x_old, y_old, width_old, height_old, _ = before.boxes[c].tolist()
             x0, x1 = max(x, x_old), min(x + width, x_old + width_old)
             y0, y1 = max(y, y_old), min(y + height, y_old + height_old)
             old = np.full((height, width), self.margins[c] - 0.5, np.float32)
@@ -219,34 +226,44 @@ def cleaned(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def _cleaned_piece(mask: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], int, int]:
-    """The part of the cleaned mask that holds all its foreground, and its first column and row."""
+    """The smallest part of the cleaned mask that holds all its foreground, and its first column and row."""
     x, y, width, height = cv2.boundingRect(mask)
     if width == 0:
         return np.zeros((0, 0), np.uint8), x, y
     every = np.not_equal(mask[y : y + height, x : x + width], 0).view(np.uint8)
     # Most specks are lone pixels: dropped at once, where the largest blob is large enough, which nearly always is so.
     rest, left, top = _outlined(every & np.asarray(cv2.dilate(every, _NEIGHBOURS), np.uint8), x, y)
-    if rest.size and _drop_small(rest) > SMALL_BLOB * LONE_AREA:
-        return rest, left, top
+    if rest.size:
+        largest, dropped = _drop_small(rest)
+        if largest > SMALL_BLOB * LONE_AREA:
+            return _outlined(rest, left, top) if dropped else (rest, left, top)
     _drop_small(every)
-    return every, x, y
+    return _outlined(every, x, y)
 
 
-def _drop_small(piece: NDArray[np.uint8]) -> float:
-    """In place: blobs and holes that are far too small beside the largest blob go; its area, px."""
+def _drop_small(piece: NDArray[np.uint8]) -> tuple[float, bool]:
+    """In place: blobs and holes that are far too small beside the largest blob go.
+
+    Returns:
+        the largest blob's area, px, and whether blobs went.
+    """
     contours, hierarchy = cv2.findContours(piece, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
     # A contour runs through the centres of its pixels: half its length more is the area of the pixels themselves,
     # half its length less that of the hole it surrounds.
-    outer = hierarchy[0, :, 3] < 0
-    half_length = np.array([0.5 * len(contour) for contour in contours])
-    area = np.array([cv2.contourArea(contour) for contour in contours]) + np.where(outer, 1, -1) * half_length
-    largest = float(area[outer].max())
+    outer = [parent < 0 for parent in hierarchy[0, :, 3].tolist()]
+    areas = [
+        cv2.contourArea(contour) + (0.5 if blob else -0.5) * len(contour)
+        for contour, blob in zip(contours, outer, strict=True)
+    ]
+    largest = max(area for area, blob in zip(areas, outer, strict=True) if blob)
+    blobs = [n for n, blob in enumerate(outer) if blob and areas[n] < largest / SMALL_BLOB]
+    holes = [n for n, blob in enumerate(outer) if not blob and areas[n] < 0.015 * largest]
     # One by one, for those that touch must not cancel out; only the one, for OpenCV copies the list it is given.
-    for i in map(int, np.flatnonzero(outer & (area < largest / SMALL_BLOB))):
-        cv2.drawContours(piece, [contours[i]], 0, 0, cv2.FILLED)
-    for i in map(int, np.flatnonzero(~outer & (area < 0.015 * largest))):
-        cv2.drawContours(piece, [contours[i]], 0, 1, cv2.FILLED)
-    return largest
+    for n in blobs:
+        cv2.drawContours(piece, [contours[n]], 0, 0, cv2.FILLED)
+    for n in holes:
+        cv2.drawContours(piece, [contours[n]], 0, 1, cv2.FILLED)
+    return largest, bool(blobs)
 
 
 def pack_cameras(rig: Rig) -> NDArray[np.float64]:
@@ -322,8 +339,8 @@ def measure_silhouettes(
             if blind is not None:
                 whole = blind.copy()
                 whole[y : y + piece.shape[0], x : x + piece.shape[1]] |= piece
-                piece, x, y = whole, 0, 0
-            usable.append(_outlined(piece, x, y))
+                piece, x, y = _outlined(whole, 0, 0)
+            usable.append((piece, x, y))
             ignored.append(blind)
             rows.append(row)
     silhouettes = Silhouettes(
@@ -377,28 +394,30 @@ def _measured(whole: Silhouettes, old: Silhouettes | None) -> Silhouettes:
     seen = nearest > 0
     margins[seen] = np.minimum(margins[seen], np.ceil(whole.cameras[seen, 12] * whole.band_m / nearest[seen]) + 2)
     boxes = np.zeros((count, 5), np.int64)
-    reused = np.zeros(count, np.bool_)
+    reused = [False] * count
     offset = 0
-    for c, mask in enumerate(whole.masks):
-        reused[c] = old is not None and mask is old.masks[c] and margins[c] <= old.margins[c]
+    for c, (mask, frame, (columns, rows)) in enumerate(
+        zip(whole.masks, whole.counts.frames.tolist(), images.tolist(), strict=True)
+    ):
+        reused[c] = old is not None and mask is old.masks[c] and bool(margins[c] <= old.margins[c])
         if old is not None and reused[c]:
             margins[c] = old.margins[c]
-            boxes[c] = old.boxes[c]
+            x0, y0, width, height, _ = old.boxes[c].tolist()
         else:
-            x, y, width, height, _ = whole.counts.frames[c]
+            x, y, width, height, _ = frame
             margin = int(margins[c])
             x0, y0 = max(x - margin, 0), max(y - margin, 0)
-            x1, y1 = min(x + width + margin, images[c, 0]), min(y + height + margin, images[c, 1])
-            boxes[c, :4] = x0, y0, x1 - x0, y1 - y0
-        boxes[c, 4] = offset
-        offset += int(boxes[c, 2] * boxes[c, 3])
+            width = min(x + width + margin, columns) - x0
+            height = min(y + height + margin, rows) - y0
+        boxes[c] = x0, y0, width, height, offset
+        offset += width * height
     field = np.empty(offset, np.float32)
     measured = replace(whole, boxes=boxes, margins=margins, field=field, blocks=blocks)
     for c in range(count):
         if old is not None and reused[c]:
             measured.piece(c)[:] = old.piece(c)
         else:
-            x, y, width, height, _ = (int(n) for n in boxes[c])
+            x, y, width, height, _ = boxes[c].tolist()
             piece, _, _ = whole.part_of_mask(c, x, x + width, y, y + height)
             _measure(piece, int(margins[c]), measured.piece(c))
     return measured
