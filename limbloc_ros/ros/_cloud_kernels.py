@@ -14,8 +14,9 @@ def write_rows(
     words: Any,
     numbers: Any,
     halves: Any,
-    indices: Any,
     sdf: Any,
+    band: Any,
+    first: Any,
     cut_by: Any,
     viewpoints: Any,
     nobody: int,
@@ -27,26 +28,35 @@ def write_rows(
 
     Args:
         words, numbers, halves: the same rows as uint32 [V, 12], float32 [V, 12] and int16 [V, 24].
-        indices: int32 [V, 3].
-        sdf: float32 [V] m.
-        cut_by: uint8 [V] rows of `viewpoints`, or other numbers: nobody is known there.
+        sdf: float32 [X, Y, Z] m, of which V are below `band`.
+        band: float32, m.
+        first: int64 [3] lattice indices of the first voxel.
+        cut_by: uint8 [X, Y, Z] rows of `viewpoints`, or other numbers: nobody is known there; [0, 0, 0] if nowhere.
         viewpoints: float32 [C, 3] m.
         nobody: what is written for those.
         voxel_m: edge of a voxel; voxel_um, band_um: it and the band in micrometres.
     """
-    for n in range(len(indices)):
-        for axis in range(3):
-            numbers[n, axis] = np.float32((indices[n, axis] + 0.5) * voxel_m)
-            halves[n, 8 + axis] = np.int16(indices[n, axis])
-        numbers[n, 3] = sdf[n]
-        camera = np.int64(cut_by[n])
-        known = camera < len(viewpoints)
-        halves[n, 11] = np.int16(camera if known else nobody)
-        words[n, 6] = np.uint32(voxel_um)
-        words[n, 7] = np.uint32(band_um)
-        for axis in range(3):
-            numbers[n, 8 + axis] = viewpoints[camera, axis] if known else np.float32(0.0)
-        words[n, 11] = np.uint32(0)
+    n = 0
+    for i in range(sdf.shape[0]):
+        x = np.float32((first[0] + i + 0.5) * voxel_m)
+        for j in range(sdf.shape[1]):
+            y = np.float32((first[1] + j + 0.5) * voxel_m)
+            row = sdf[i, j]
+            for k in range(len(row)):
+                if not row[k] < band:
+                    continue
+                point, number, half = words[n], numbers[n], halves[n]
+                number[0], number[1], number[2] = x, y, np.float32((first[2] + k + 0.5) * voxel_m)
+                number[3] = row[k]
+                half[8], half[9], half[10] = first[0] + i, first[1] + j, first[2] + k
+                camera = np.int64(cut_by[i, j, k]) if cut_by.size > 0 else nobody
+                known = camera < len(viewpoints)
+                half[11] = camera if known else nobody
+                point[6], point[7] = voxel_um, band_um
+                for axis in range(3):
+                    number[8 + axis] = viewpoints[camera, axis] if known else np.float32(0.0)
+                point[11] = 0
+                n += 1
 
 
 @njit(cache=True, nogil=True)

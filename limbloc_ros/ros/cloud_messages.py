@@ -68,11 +68,10 @@ _HULL_FIELDS = _fields(HULL_POINT)
 _SURFACE_FIELDS = _fields(SURFACE_POINT)
 
 
-def _cloud(points: NDArray[np.void], fields: list[PointField], header: Header) -> PointCloud2:
-    msg = PointCloud2(header=header, height=1, width=len(points), fields=fields, is_dense=True)
-    msg.point_step, msg.row_step = points.dtype.itemsize, points.nbytes
-    data = array("B")
-    data.frombytes(points.view(np.uint8).data)
+def _cloud(data: array[int], point: np.dtype[np.void], fields: list[PointField], header: Header) -> PointCloud2:
+    """The cloud whose points these bytes are."""
+    msg = PointCloud2(header=header, height=1, width=len(data) // point.itemsize, fields=fields, is_dense=True)
+    msg.point_step, msg.row_step = point.itemsize, len(data)
     msg.data = data  # the constructor would copy it byte by byte
     return msg
 
@@ -95,19 +94,23 @@ def hull_to_cloud(hull: Hull, header: Header) -> PointCloud2:
         InputError: sizes that are not whole micrometres, or a hull more than 32767 voxels from the world's origin.
     """
     check_voxel_size(hull.voxel_m, hull.band_m)
-    indices, sdf = hull.shell()
-    if len(indices) and (indices.min() < -32768 or indices.max() > 32767):
+    band = np.float32(hull.band_m)
+    count = int(np.count_nonzero(hull.sdf < band))
+    if count == 0:
+        return empty_hull_cloud(header)
+    # The outermost cells of a hull's grid are empty.
+    low, high = min(hull.index_min) + 1, max(n + i for n, i in zip(hull.sdf.shape, hull.index_min, strict=True)) - 2
+    if low < -32768 or high > 32767:
         raise InputError(
-            f"the hull's voxels have indices {indices.min()} to {indices.max()}; expected -32768 to 32767: "
+            f"the hull's voxels have indices {low} to {high}; expected -32768 to 32767: "
             "move the world's origin into the room, or use larger voxels"
         )
-    words = np.empty((len(indices), HULL_POINT.itemsize // 4), np.uint32)
-    cut_by = np.full(len(indices), NOBODY, np.uint8)
-    if hull.cut_by is not None and len(hull.viewpoints):
-        cut_by = hull.cut_by[hull.sdf < np.float32(hull.band_m)]
+    data = array("B", bytes(1)) * (count * HULL_POINT.itemsize)
+    words = np.frombuffer(data, np.uint32).reshape(count, -1)  # the message's own memory
+    cut_by = hull.cut_by if hull.cut_by is not None else np.zeros((0, 0, 0), np.uint8)
     kernels.write_rows(
-        words, words.view(np.float32), words.view(np.int16), indices, sdf, cut_by, hull.viewpoints, NOBODY,
-        hull.voxel_m, round(hull.voxel_m * 1e6), round(hull.band_m * 1e6),
+        words, words.view(np.float32), words.view(np.int16), hull.sdf, band, np.array(hull.index_min), cut_by,
+        hull.viewpoints, NOBODY, hull.voxel_m, round(hull.voxel_m * 1e6), round(hull.band_m * 1e6),
     )  # fmt: skip
     if hull.views is not None:
         packed = hull.views.packed
@@ -115,13 +118,12 @@ def hull_to_cloud(hull: Hull, header: Header) -> PointCloud2:
         if len(padded) < len(words):
             words[0, 11] = len(packed)
             words[1 : 1 + len(padded), 11] = padded
-    points = words.view(HULL_POINT)[:, 0]
-    return _cloud(points, _HULL_FIELDS, header)
+    return _cloud(data, HULL_POINT, _HULL_FIELDS, header)
 
 
 def empty_hull_cloud(header: Header) -> PointCloud2:
     """Nobody is there at this instant."""
-    return _cloud(np.zeros(0, HULL_POINT), _HULL_FIELDS, header)
+    return _cloud(array("B"), HULL_POINT, _HULL_FIELDS, header)
 
 
 def cloud_to_hull(msg: PointCloud2) -> Hull | None:
@@ -196,4 +198,6 @@ def surface_to_cloud(surface: Surface, geodesic: NDArray[np.float64], header: He
         points[f"normal_{name}"] = surface.normals[:, axis]
     points["curvature"] = surface.curvature
     points["geodesic"] = geodesic
-    return _cloud(points, _SURFACE_FIELDS, header)
+    data = array("B")
+    data.frombytes(points.view(np.uint8).data)
+    return _cloud(data, SURFACE_POINT, _SURFACE_FIELDS, header)
