@@ -6,7 +6,7 @@ import dataclasses
 import figure_poses
 import numpy as np
 import pytest
-from energy_cases import BARE, NOTHING, VOXEL, a_person, entangled, only, ray_distances, turned_from_rest
+from energy_cases import BARE, NOTHING, VOXEL, a_person, entangled, only, ray_distances, size, turned_from_rest
 
 from limbloc_ros.core import energy, figure
 from limbloc_ros.core.energy import Weights
@@ -19,6 +19,24 @@ def case():
     return a_person()
 
 
+@pytest.mark.parametrize("step_m", [1e-4, 0.01, 0.2])
+def test_what_is_remembered_of_the_last_figure_changes_nothing(case, step_m):
+    _, evidence, state = case
+    rng = np.random.default_rng(7)
+    rays = rng.normal(size=evidence.points.shape)
+    rays[::3] = 0.0
+    rays[rays.any(axis=1)] /= np.linalg.norm(rays[rays.any(axis=1)], axis=1, keepdims=True)
+    evidence = dataclasses.replace(evidence, rays=rays)
+    terms = only(surface=1.0, normal_gate_m=0.1)
+    for _ in range(12):
+        state = state.moved(step_m * rng.normal(size=size(state)))
+        fresh = dataclasses.replace(evidence)
+        assert (fresh.nearest.hints == -1).all()
+        known, anew = energy.system(state, evidence, terms), energy.system(state, fresh, terms)
+        assert known.cost == anew.cost
+        np.testing.assert_array_equal(known.matrix, anew.matrix)
+
+
 def test_the_true_figure_explains_its_own_surface(case):
     truth, evidence, state = case
     assert energy.system(truth, evidence, only(surface=1.0)).cost < 1e-12
@@ -26,12 +44,13 @@ def test_the_true_figure_explains_its_own_surface(case):
 
 
 def surface_cost(point, normal, gate=0.0, inside=2.0, width=0.1, ray=(0.0, 0.0, 0.0), hint=-1):
-    hints = np.array([hint])
+    nearest = energy.NearestParts.unknown(1, 2, 2)
+    nearest.hints[:] = hint
     spheres, radii = np.array([[0.0, 0.0, 0.0], [0.5, 0.0, 0.0]]), np.array([0.1, 0.1])
     parts = np.array([[0, 0, 0], [1, 1, 1]])
     blocks, slopes = np.zeros((2, 12, 12)), np.zeros((2, 12))
     cost = energy.surface_term(
-        np.array([point]), np.array([normal]), np.array([ray]), np.ones(1), hints,
+        np.array([point]), np.array([normal]), np.array([ray]), np.ones(1), *nearest,
         parts, spheres, radii, width, gate, inside, blocks, slopes,
     )  # fmt: skip
     return cost, slopes

@@ -133,6 +133,8 @@ def gather(blocks: Any, slopes: Any, parts: Any, J: Any, A: Any, g: Any) -> None
             for i in range(4):
                 force[s, i] += slopes[p, 4 * k + i]
             for m in range(3):
+                if block[4 * m + 3, 4 * m + 3] == 0.0:
+                    continue
                 q = parts[p, m]
                 for i in range(4):
                     a = 4 * k + i

@@ -11,6 +11,9 @@ from numba import njit
 
 from limbloc_ros.core._part_kernels import SLACK, distance_to_part, lay_out
 
+#: A figure that has moved by more than this, m, is looked at anew.
+FORGET_M = 0.1
+
 
 @njit(cache=True, inline="always", error_model="numpy")  # type: ignore[misc, unused-ignore]
 def robust_weight(d: float, width: float) -> tuple[float, float]:
@@ -40,6 +43,33 @@ def add_block(block: Any, slope: Any, w: Any, away: Any, residual: float, weight
                     block[4 * k + i, 4 * m + j] += both * away[j]
 
 
+@njit(cache=True, inline="always", error_model="numpy")  # type: ignore[misc, unused-ignore]
+def gated_distance(
+    row: Any, x: float, y: float, z: float, ray: Any, nx: float, ny: float, nz: float, gate: float
+) -> tuple[float, float, float, float]:
+    """Signed distance to a part of `lay_out`, the same plus what the gate adds, weights of its 2nd and 3rd sphere.
+
+    A part whose surface looks the other way than the normal counts as up to 2 `gate` further off.
+    """
+    d, wb, wc = distance_to_part(row, x, y, z, ray)
+    gated = d
+    if d > 0.0 and gate > 0.0:
+        facing = (
+            (x - row[1] - wb * row[4] - wc * row[7]) * nx
+            + (y - row[2] - wb * row[5] - wc * row[8]) * ny
+            + (z - row[3] - wb * row[6] - wc * row[9]) * nz
+        )
+        gated += gate * (1.0 - facing / (d + row[10] + wb * row[11] + wc * row[12] + 1e-12))
+    return d, gated, wb, wc
+
+
+@njit(cache=True, inline="always", error_model="numpy")  # type: ignore[misc, unused-ignore]
+def across(normal: Any, ray: Any) -> tuple[float, float, float]:
+    """What of a normal [3] lies across a ray (unit; zero for none)."""
+    along = normal[0] * ray[0] + normal[1] * ray[1] + normal[2] * ray[2]
+    return normal[0] - along * ray[0], normal[1] - along * ray[1], normal[2] - along * ray[2]
+
+
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def nearest_part(
     point: Any, normal: Any, ray: Any, rows: Any, bounds: Any, gate: float, within: float, hint: int, far: Any, w: Any
@@ -47,28 +77,18 @@ def nearest_part(
     """The part that explains a surface point best, and its distance plus what the gate adds; -1 if none is `within`.
 
     With a `ray` (unit; zero for none) any point of the ray may be explained. Seen along it spheres are circles, so the
-    distances are those of the spheres' projections. A part whose surface looks the other way than `normal` counts as
-    up to 2 `gate` further off. `hint` is asked first: neighbouring points mostly have the same part, and then nearly
-    all others are out of reach. `rows`, `bounds`: of `lay_out`. Writes the nearest sphere's barycentric weights to
-    w [3]; far [P] is scratch.
+    distances are those of the spheres' projections. `hint` is asked first: neighbouring points mostly have the same
+    part, and then nearly all others are out of reach. `rows`, `bounds`: of `lay_out`. Writes the nearest sphere's
+    barycentric weights to w [3]; far [P] is scratch.
     """
     x, y, z = point[0], point[1], point[2]
-    across = normal[0] * ray[0] + normal[1] * ray[1] + normal[2] * ray[2]
-    nx, ny, nz = normal[0] - across * ray[0], normal[1] - across * ray[1], normal[2] - across * ray[2]
+    nx, ny, nz = across(normal, ray)
     best = within
     best_part = -1
     for n in range(-1, len(rows)):
         p = hint if n < 0 else n
         if p >= 0 and (n < 0 or (n != hint and far[n] <= 0.0)):
-            row = rows[p]
-            d, wb, wc = distance_to_part(row, x, y, z, ray)
-            if 0.0 < d < best and gate > 0.0:
-                facing = (
-                    (x - row[1] - wb * row[4] - wc * row[7]) * nx
-                    + (y - row[2] - wb * row[5] - wc * row[8]) * ny
-                    + (z - row[3] - wb * row[6] - wc * row[9]) * nz
-                )
-                d += gate * (1.0 - facing / (d + row[10] + wb * row[11] + wc * row[12] + 1e-12))
+            _, d, wb, wc = gated_distance(rows[p], x, y, z, ray, nx, ny, nz, gate)
             if d < best or (d == best and p < best_part):  # of equals the first, whatever the hint
                 best = d
                 best_part = p
@@ -82,6 +102,64 @@ def nearest_part(
                 reach = max(best + bounds[3, m] + SLACK, 0.0)
                 far[m] = bx * bx + by * by + bz * bz - along * along - reach * reach
     return best, best_part
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def parts_moved(parts: Any, spheres: Any, radii: Any, before: Any, radii_before: Any) -> tuple[Any, float]:
+    """By how much the distance to each part [P] can have changed, m, since its spheres were elsewhere; and the most."""
+    by_sphere = np.empty(len(radii))
+    for s in range(len(radii)):
+        x, y, z = spheres[s, 0] - before[s, 0], spheres[s, 1] - before[s, 1], spheres[s, 2] - before[s, 2]
+        by_sphere[s] = math.sqrt(x * x + y * y + z * z) + abs(radii[s] - radii_before[s])
+    moved = np.empty(len(parts), np.float32)
+    most = 0.0
+    for p in range(len(parts)):
+        by = max(by_sphere[parts[p, 0]], by_sphere[parts[p, 1]], by_sphere[parts[p, 2]])
+        moved[p] = by + SLACK
+        most = max(most, by)
+    return moved, most
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def explaining_part(
+    point: Any, normal: Any, ray: Any, rows: Any, gate: float, hint: int, least: Any, moved: Any, w: Any
+) -> int:
+    """The part that explains a surface point best, of those that can: as `nearest_part`, by what is known of before.
+
+    `least` [P]: no part was nearer than this then; `moved` [P]: by how much that can have changed. What is learned
+    here is written to `least`.
+    """
+    x, y, z = point[0], point[1], point[2]
+    nx, ny, nz = across(normal, ray)
+    plain, best, wb, wc = gated_distance(rows[hint], x, y, z, ray, nx, ny, nz, gate)
+    least[hint] = max(least[hint], np.float32(plain) - moved[hint])
+    best_part = hint
+    reach = np.float32(best + SLACK)
+    able = 0
+    for p in range(len(rows)):
+        able += least[p] - moved[p] <= reach
+    if able > 1:
+        for p in range(len(rows)):
+            if least[p] - moved[p] <= reach and p != hint:
+                plain, d, b, c = gated_distance(rows[p], x, y, z, ray, nx, ny, nz, gate)
+                least[p] = max(least[p], np.float32(plain) - moved[p])
+                if d < best or (d == best and p < best_part):  # of equals the first, whatever the hint
+                    best, best_part, wb, wc = d, p, b, c
+                    reach = np.float32(best + SLACK)
+    w[0] = 1.0 - wb - wc
+    w[1] = wb
+    w[2] = wc
+    return best_part
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def bound_distances(point: Any, ray: Any, bounds: Any, least: Any) -> None:
+    """Write to `least` [P] how near each part is at least: what `lay_out` puts around it."""
+    x, y, z = point[0], point[1], point[2]
+    for p in range(len(least)):
+        bx, by, bz = bounds[0, p] - x, bounds[1, p] - y, bounds[2, p] - z
+        along = bx * ray[0] + by * ray[1] + bz * ray[2]
+        least[p] = np.float32(math.sqrt(max(bx * bx + by * by + bz * bz - along * along, 0.0)) - bounds[3, p])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
@@ -145,6 +223,9 @@ def surface_term(
     rays: Any,
     weight_of: Any,
     hints: Any,
+    least: Any,
+    spheres_then: Any,
+    radii_then: Any,
     parts: Any,
     spheres: Any,
     radii: Any,
@@ -156,17 +237,26 @@ def surface_term(
 ) -> float:
     """Hull surface points to the nearest part: the figure should explain the whole surface (see `nearest_part`).
 
-    `hints` [Q] holds the part of each point the last time, and is written: from step to step it is mostly the same.
+    From step to step figures move by millimetres, and a distance changes by no more than the figure moves. So it is
+    kept how near each part was at least (`least` [Q, P]) when its spheres were at `spheres_then` [S, 3], of radii
+    `radii_then` [S], and which part was the nearest (`hints` [Q]): few others need be asked. All four are written.
     """
     rows, bounds = lay_out(parts, spheres, radii)
+    moved, most = parts_moved(parts, spheres, radii, spheres_then, radii_then)
+    anew = not most <= FORGET_M  # also where nothing is known yet
+    if anew:
+        spheres_then[:] = spheres
+        radii_then[:] = radii
+        moved[:] = SLACK
     w = np.empty(3)
     away = np.ones(4)
-    far = np.empty(len(parts))
-    p = -1
     cost = 0.0
+    p = 0
     for q in range(len(query)):
+        if anew:
+            bound_distances(query[q], rays[q], bounds, least[q])
         hint = hints[q] if hints[q] >= 0 else p
-        _, p = nearest_part(query[q], normals[q], rays[q], rows, bounds, gate, 1e9, hint, far, w)
+        p = explaining_part(query[q], normals[q], rays[q], rows, gate, hint, least[q], moved, w)
         hints[q] = p
         d = offset_from(query[q], rays[q], parts[p], w, spheres, radii, away)
         c, wd = robust_weight(d, width)

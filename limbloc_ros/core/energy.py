@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,6 +58,28 @@ class Weights:
     clothing: float = 4e-6
 
 
+class NearestParts(NamedTuple):
+    """What `surface_term` remembers of Q points and a figure of P parts and S spheres; it is written in place.
+
+    Attributes:
+        hints: int64 [Q] the part that explained each point.
+        least: float32 [Q, P] how near, m, each part was at least when the spheres were where they are said to be.
+        spheres: [S, 3] where that was, m.
+        radii: [S] their radii then, m.
+    """
+
+    hints: NDArray[np.int64]
+    least: NDArray[np.float32]
+    spheres: Array
+    radii: Array
+
+    @staticmethod
+    def unknown(points: int, parts: int, spheres: int) -> NearestParts:
+        """Of a figure that was never looked at: it was infinitely far away."""
+        far_away = np.full((spheres, 3), np.inf)
+        return NearestParts(np.full(points, -1), np.zeros((points, parts), np.float32), far_away, np.zeros(spheres))
+
+
 @dataclass(frozen=True)
 class Evidence:
     """What the fit looks at: points of the hull's surface and the signed distance grid.
@@ -70,7 +93,7 @@ class Evidence:
         sdf: float32 [nx, ny, nz], m.
         origin: [3] centre of sdf[0, 0, 0], m, world.
         voxel_m: edge length of a voxel, m.
-        hints: int64 [Q] the part that explained each point when the energy was last worked out; saves time only.
+        nearest: what was found out when the energy was worked out before; saves time only.
     """
 
     points: Array
@@ -80,10 +103,11 @@ class Evidence:
     sdf: NDArray[np.float32]
     origin: Array
     voxel_m: float
-    hints: NDArray[np.int64] = field(init=False, repr=False, compare=False)
+    nearest: NearestParts = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "hints", np.full(len(self.points), -1))
+        nothing = NearestParts.unknown(len(self.points), figure.N_PARTS, figure.N_SPHERES)
+        object.__setattr__(self, "nearest", nothing)
 
 
 def _axis_rotation(axis: int, degrees: float) -> Array:
@@ -232,7 +256,7 @@ def system(state: FigureState, evidence: Evidence, weights: Weights) -> System:
         evidence.normals,
         evidence.rays,
         w.surface * evidence.point_weights,
-        evidence.hints,
+        *evidence.nearest,
         *flesh,
         w.surface_width_m,
         w.normal_gate_m,
