@@ -105,6 +105,53 @@ def split_blocks(blocks: Any, size: int, upper: Any) -> Any:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def root_blocks(lower: Any, upper: Any, size: int) -> Any:
+    """Blocks of `size` voxels that fill a box of the lattice (`upper` exclusive), int32 [B, 3]."""
+    ni, nj, nk = (upper - lower + size - 1) // size
+    out = np.empty((ni * nj * nk, 3), np.int32)
+    for n in range(len(out)):
+        out[n, 0] = lower[0] + n // (nj * nk) * size
+        out[n, 1] = lower[1] + n // nk % nj * size
+        out[n, 2] = lower[2] + n % nk * size
+    return out
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def pick_blocks(blocks: Any, kept: Any) -> Any:
+    """Those of the blocks [B, 3] that are kept, bool [B]."""
+    out = np.empty((np.count_nonzero(kept), 3), np.int32)
+    count = 0
+    for n in range(len(blocks)):
+        if kept[n]:
+            out[count, 0], out[count, 1], out[count, 2] = blocks[n, 0], blocks[n, 1], blocks[n, 2]
+            count += 1
+    return out
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def find_blocks(
+    lower: Any, upper: Any, root: int, leaf: int, voxel: float, cams: Any, frames: Any, sums: Any, band: float,
+    min_seen: int, gained: Any,
+) -> Any:  # fmt: skip
+    """The blocks of `leaf` voxels [B, 3] in a box of the lattice (`upper` exclusive) that may hold a wanted voxel (see
+    `near_blocks`), found by halving blocks of `root` voxels.
+
+    `gained` is `frames` and `sums` of other pixels: only blocks that may lie within the band of these are wanted. If it
+    has no frames, all are.
+    """
+    blocks = root_blocks(lower, upper, root)
+    size = root
+    while True:
+        if len(gained[0]) > 0:
+            blocks = pick_blocks(blocks, blocks_beside(blocks, size, voxel, cams, gained[0], gained[1], band))
+        blocks = pick_blocks(blocks, near_blocks(blocks, size, voxel, cams, frames, sums, band, min_seen))
+        if size == leaf:
+            return blocks
+        blocks = split_blocks(blocks, size, upper)
+        size //= 2
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def nearest_depths(blocks: Any, size: int, voxel: float, cams: Any) -> Any:
     """The least depth (m) at which each camera may see a voxel of the blocks; inf if it sees none."""
     centres, radius = block_balls(blocks, size, voxel)

@@ -365,7 +365,10 @@ def label_components(sdf: Any, limit: Any) -> tuple[Any, Any, Any]:
     for row in range(nx * ny):
         start[row] = count
         line = sdf[row // ny, row % ny]
-        k = 0
+        some = False
+        for k in range(nz):
+            some |= line[k] < limit
+        k = 0 if some else nz  # most rows are empty
         while k < nz:
             if not line[k] < limit:
                 k += 1

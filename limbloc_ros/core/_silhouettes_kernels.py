@@ -10,27 +10,47 @@ from numba import njit
 
 #: So many pixels of a row are measured together: two to four vector registers of integers.
 CHUNK = 32
+#: What is neither foreground nor background, for it is not in the image.
+BESIDE = 2
 #: Up to this distance the squares, also of four steps more, and their sums fit into 16 bits.
 SHORT_PX = 178
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
-def column_distances(mask: Any, out: Any) -> None:
-    """To `out`, uint16: distance of every pixel to the nearest one of the other kind in its column.
+def widen(mask: Any) -> Any:
+    """A mask of 0 and 1 with as many columns of BESIDE as make its width a multiple of CHUNK.
 
-    Where there is none: further than every pixel of the mask. (Image sides together have less than 65536 pixels.)
+    Loops over rows, of so many times CHUNK pixels, become vector code without rests: twice to five times as fast for
+    rows of a hundred pixels, which most are.
     """
     height, width = mask.shape
+    out = np.full((height, (width + CHUNK - 1) // CHUNK * CHUNK), np.uint8(BESIDE))
+    for y in range(height):
+        row, wide = mask[y], out[y]
+        for x in range(width):
+            wide[x] = row[x]
+    return out
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def column_distances(mask: Any, far: Any, out: Any) -> None:
+    """To `out`, uint16: distance of every pixel to the nearest one of another kind in its column; `far` or more where
+    there is none. The width is a multiple of CHUNK."""
+    height, width = mask.shape
     one = np.uint16(1)
-    out[0] = height + width
+    out[0] = far
     for y in range(1, height):
         here, there, row, other = out[y], out[y - 1], mask[y], mask[y - 1]
-        for x in range(width):
-            here[x] = np.uint16(there[x] + one) if row[x] == other[x] else one
+        for at in range(0, width, CHUNK):
+            for i in range(CHUNK):
+                x = np.uint64(at) + np.uint64(i)  # unsigned: numba need not ask whether to count from the end
+                here[x] = np.uint16(there[x] + one) if row[x] == other[x] else one
     for y in range(height - 2, -1, -1):
         here, there, row, other = out[y], out[y + 1], mask[y], mask[y + 1]
-        for x in range(width):
-            here[x] = min(here[x], np.uint16(there[x] + one) if row[x] == other[x] else one)
+        for at in range(0, width, CHUNK):
+            for i in range(CHUNK):
+                x = np.uint64(at) + np.uint64(i)
+                here[x] = min(here[x], np.uint16(there[x] + one) if row[x] == other[x] else one)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
@@ -74,25 +94,30 @@ def signed_distance(mask: Any, most: int, deepest: int, numbers: Any, out: Any) 
     twice as many are measured in the same time.
     """
     height, width = mask.shape
-    columns = np.empty((height, width), np.uint16)
-    column_distances(mask, columns)
+    mask = widen(mask)
+    columns = np.empty(mask.shape, np.uint16)  # image sides together have less than 65536 pixels
+    column_distances(mask, np.uint16(height + width), columns)
     number = numbers.dtype.type
     pad = max(width, CHUNK) + 4  # the furthest that `nearest_in_row` looks beyond the row's ends
     end = pad + width
     beyond, within = number(most * most), number(deepest * deepest)
-    inner = np.full(end + pad, within, numbers.dtype)  # of foreground pixels; 0 where there is background
-    outer = np.full(end + pad, beyond, numbers.dtype)  # of background pixels; 0 where there is foreground
+    size = pad + mask.shape[1] + pad
+    inner = np.full(size, within, numbers.dtype)  # of foreground pixels; 0 where there is background
+    outer = np.full(size, beyond, numbers.dtype)  # of background pixels; 0 where there is foreground
     best_inner = np.zeros_like(inner)
     best_outer = np.zeros_like(outer)
     shallow = True
     for y in range(height):
-        row, column, inside, outside = mask[y], columns[y], inner[pad:end], outer[pad:end]
-        for x in range(width):
-            d = min(np.int32(column[x]), np.int32(deepest))
-            inside[x] = d * d if row[x] != 0 else 0
-        for x in range(width):
-            d = min(np.int32(column[x]), np.int32(most))
-            outside[x] = 0 if row[x] != 0 else d * d
+        row, column, inside, outside = mask[y], columns[y], inner[pad:], outer[pad:]
+        for at in range(0, len(row), CHUNK):
+            for i in range(CHUNK):
+                x = np.uint64(at) + np.uint64(i)
+                d = number(min(column[x], np.uint16(deepest)))
+                inside[x] = number(0) if row[x] == 0 else number(d * d)
+            for i in range(CHUNK):
+                x = np.uint64(at) + np.uint64(i)
+                d = number(min(column[x], np.uint16(most)))
+                outside[x] = number(0) if row[x] == 1 else number(d * d)
         first, last = 0, width - 1
         while first < width and outside[first] == beyond:
             first += 1
@@ -106,9 +131,11 @@ def signed_distance(mask: Any, most: int, deepest: int, numbers: Any, out: Any) 
                 nearest_in_row(inner, pad + left, width, best_inner)
                 nearest_in_row(outer, pad + left, width, best_outer)
         inside, outside, distance = best_inner[pad:end], best_outer[pad:end], out[y]
+        deep = number(0)
         for x in range(width):
             d = np.sqrt(np.float32(inside[x] + outside[x])) - np.float32(0.5)  # one of them is 0
             distance[x] = -d if row[x] != 0 else d
         for x in range(width):
-            shallow &= inside[x] < within
+            deep = max(deep, inside[x])
+        shallow &= deep < within
     return shallow

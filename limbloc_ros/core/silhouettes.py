@@ -95,6 +95,7 @@ class Silhouettes:
         lattice: int64 [2, 3] lowest and highest (exclusive) lattice indices in the carve volume.
         band_m: how far outside a silhouette distances are needed, m.
         blocks: int32 [B, 3] lowest lattice indices of the blocks of LEAF voxels that can hold voxels that matter.
+        nearest: float64 [C] the least depth at which each camera may see a voxel of the blocks, m; inf if it sees none.
         ignored: uint8 [height, width] of each camera, 1 where its image means nothing; None where it has no such part.
     """
 
@@ -110,6 +111,7 @@ class Silhouettes:
     lattice: NDArray[np.int64]
     band_m: float
     blocks: NDArray[np.int32]
+    nearest: NDArray[np.float64]
     ignored: tuple[NDArray[np.uint8] | None, ...]
 
     def piece(self, c: int) -> NDArray[np.float32]:
@@ -158,6 +160,7 @@ class Silhouettes:
             counts=self.counts.pick(keep),
             margins=self.margins[keep],
             blocks=self.blocks[:0],  # without a camera there are more: all are looked for again
+            nearest=self.nearest[keep],
             ignored=tuple(self.ignored[i] for i in keep),
         )
         return _measured(rest, rest)
@@ -193,6 +196,10 @@ class Silhouettes:
             old[y0 - y : y1 - y, x0 - x : x1 - x] = before.piece(c)[y0 - y_old : y1 - y_old, x0 - x_old : x1 - x_old]
             changed.append(_outlined(np.less(self.piece(c), old).view(np.uint8), x, y))
         return PixelCounts.of(changed)
+
+
+#: No pixel of any camera.
+_NONE = PixelCounts(np.zeros((0, 5), np.int64), np.zeros(0, np.int32))
 
 
 def signed_distance_px(mask: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -356,6 +363,7 @@ def measure_silhouettes(
         lattice=np.stack(lattice_bounds(rig, config.voxel_m)),
         band_m=config.band_m,
         blocks=np.zeros((0, 3), np.int32),
+        nearest=np.full(len(rows), np.inf),
         ignored=tuple(ignored),
     )
     return _measured(silhouettes, None) if rows else silhouettes
@@ -386,8 +394,10 @@ def _measured(whole: Silhouettes, old: Silhouettes | None) -> Silhouettes:
         whole: masks and counts are right, all else is replaced.
         old: has pieces and blocks that may still do.
     """
-    blocks = _near_blocks(whole, old)
+    blocks = _new_blocks(whole, old)
     nearest = near.nearest_depths(blocks, LEAF, whole.voxel_m, whole.cameras)
+    if old is not None and len(old.blocks):
+        blocks, nearest = np.concatenate([old.blocks, blocks]), np.minimum(old.nearest, nearest)
     count = len(whole.names)
     images = whole.cameras[:, 31:33].astype(np.int64)  # width, height
     margins = images.sum(axis=1).astype(np.float64)
@@ -412,7 +422,7 @@ def _measured(whole: Silhouettes, old: Silhouettes | None) -> Silhouettes:
         boxes[c] = x0, y0, width, height, offset
         offset += width * height
     field = np.empty(offset, np.float32)
-    measured = replace(whole, boxes=boxes, margins=margins, field=field, blocks=blocks)
+    measured = replace(whole, boxes=boxes, margins=margins, field=field, blocks=blocks, nearest=nearest)
     for c in range(count):
         if old is not None and reused[c]:
             measured.piece(c)[:] = old.piece(c)
@@ -431,29 +441,21 @@ def _measure(mask: NDArray[np.uint8], most: int, out: NDArray[np.float32]) -> No
         kernels.signed_distance(mask, min(most, far), far, np.empty(0, np.int32), out)
 
 
-def _near_blocks(whole: Silhouettes, old: Silhouettes | None) -> NDArray[np.int32]:
-    """The blocks of LEAF voxels [B, 3] that can hold voxels that matter.
+def _new_blocks(whole: Silhouettes, old: Silhouettes | None) -> NDArray[np.int32]:
+    """The blocks of LEAF voxels [B, 3] that can hold voxels that matter, but those that `old` has, which remain.
 
-    Found by halving blocks that may hold some, which the masks alone tell; those that `old` has remain, and only beside
-    the foreground that was gained since then there can be more.
+    Found by halving blocks that may hold some, which the masks alone tell. Only beside the foreground that was gained
+    since then there can be more than `old` has.
     """
+    gained = whole.gained_since(old) if old is not None and len(old.blocks) else _NONE
+    seen, band_m = min_seen(len(whole.names)), whole.band_m
+    table = (whole.voxel_m, whole.cameras)
     low, high = whole.lattice
-    axes = [np.arange(low[a], high[a], ROOT, dtype=np.int32) for a in range(3)]
-    blocks: NDArray[np.int32] = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    gained = whole.gained_since(old) if old is not None and len(old.blocks) else None
-    seen = min_seen(len(whole.names))
-    size = ROOT
-    while True:
-        table = (size, whole.voxel_m, whole.cameras)
-        if gained is not None:
-            blocks = blocks[near.blocks_beside(blocks, *table, gained.frames, gained.sums, whole.band_m)]
-        blocks = blocks[near.near_blocks(blocks, *table, whole.counts.frames, whole.counts.sums, whole.band_m, seen)]
-        if size == LEAF:
-            break
-        blocks = near.split_blocks(blocks, size, high)
-        size //= 2
-    if old is None or gained is None:
+    blocks: NDArray[np.int32] = near.find_blocks(
+        low, high, ROOT, LEAF, *table, whole.counts.frames, whole.counts.sums, band_m, seen,
+        (gained.frames, gained.sums),
+    )  # fmt: skip
+    if old is None or gained is _NONE:
         return blocks
-    known = near.near_blocks(blocks, *table, old.counts.frames, old.counts.sums, whole.band_m, seen)
-    grown: NDArray[np.int32] = np.concatenate([old.blocks, blocks[~known]])
-    return grown
+    known = near.near_blocks(blocks, LEAF, *table, old.counts.frames, old.counts.sums, band_m, seen)
+    return blocks[~known]
