@@ -111,13 +111,13 @@ def signed_distance(mask: Any, most: int, deepest: int, numbers: Any, out: Any) 
         row, column, inside, outside = mask[y], columns[y], inner[pad:], outer[pad:]
         for at in range(0, len(row), CHUNK):
             for i in range(CHUNK):
-                x = np.uint64(at) + np.uint64(i)
-                d = number(min(column[x], np.uint16(deepest)))
-                inside[x] = number(0) if row[x] == 0 else number(d * d)
+                k = np.uint64(at) + np.uint64(i)
+                d = number(min(column[k], np.uint16(deepest)))
+                inside[k] = number(0) if row[k] == 0 else number(d * d)
             for i in range(CHUNK):
-                x = np.uint64(at) + np.uint64(i)
-                d = number(min(column[x], np.uint16(most)))
-                outside[x] = number(0) if row[x] == 1 else number(d * d)
+                k = np.uint64(at) + np.uint64(i)
+                d = number(min(column[k], np.uint16(most)))
+                outside[k] = number(0) if row[k] == 1 else number(d * d)
         first, last = 0, width - 1
         while first < width and outside[first] == beyond:
             first += 1

@@ -458,4 +458,5 @@ def _new_blocks(whole: Silhouettes, old: Silhouettes | None) -> NDArray[np.int32
     if old is None or gained is _NONE:
         return blocks
     known = near.near_blocks(blocks, LEAF, *table, old.counts.frames, old.counts.sums, band_m, seen)
-    return blocks[~known]
+    new: NDArray[np.int32] = blocks[~known]
+    return new
