@@ -116,6 +116,18 @@ def test_cleaning_reads_any_number_as_foreground_and_keeps_its_input():
     assert not cleaned(np.zeros((30, 30), np.uint8)).any()
 
 
+@pytest.mark.parametrize("share", [0.0, 0.001, 0.05, 0.4])
+def test_bounds_and_lone_pixels_are_those_of_opencv(share):
+    rng = np.random.default_rng(5)
+    for shape in ((1, 1), (7, 70), (70, 7), (40, 133)):
+        mask = np.uint8(rng.random(shape) < share) * np.uint8(200)
+        x, y, width, height = box = kernels.bounds(mask)
+        assert box == cv2.boundingRect(mask)
+        around = cv2.dilate(mask, np.uint8([[1, 1, 1], [1, 0, 1], [1, 1, 1]]))
+        expected = ((mask > 0) & (around > 0))[y : y + height, x : x + width]
+        np.testing.assert_array_equal(kernels.without_lone_pixels(mask, *box), expected)
+
+
 def test_small_masks_keep_their_lone_pixels():
     """Beside 99 px (98.5 as its contour gives it) a pixel is no speck; beside 130 it is."""
     for rows, kept in ((9, True), (13, False)):

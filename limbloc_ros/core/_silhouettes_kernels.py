@@ -17,6 +17,52 @@ SHORT_PX = 178
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def bounds(mask: Any) -> tuple[int, int, int, int]:
+    """First column and row, width and height of the smallest rectangle around what is not 0; all 0 if there is nothing.
+
+    What `cv2.boundingRect` does, in vector code.
+    """
+    height, width = mask.shape
+    columns = np.zeros(width, np.uint8)
+    top, bottom = 0, 0
+    for y in range(height):
+        row = mask[y]
+        some = np.uint8(0)
+        for x in range(width):
+            some = np.uint8(some | row[x])
+        if some:
+            top = y if bottom == 0 else top
+            bottom = y + 1
+            for x in range(width):
+                columns[x] |= row[x]
+    if bottom == 0:
+        return 0, 0, 0, 0
+    left, right = 0, width
+    while columns[left] == 0:
+        left += 1
+    while columns[right - 1] == 0:
+        right -= 1
+    return left, top, right - left, bottom - top
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def without_lone_pixels(mask: Any, left: int, top: int, width: int, height: int) -> Any:
+    """A rectangle of a mask, beside which all is 0: 1 where a pixel and one of its eight neighbours are not 0."""
+    every = np.zeros((height + 2, width + 2), np.uint8)
+    for y in range(height):
+        row, copy = mask[top + y, left : left + width], every[y + 1, 1:]
+        for x in range(width):
+            copy[x] = row[x] != 0
+    out = np.empty((height, width), np.uint8)
+    for y in range(height):
+        above, here, below, kept = every[y], every[y + 1], every[y + 2], out[y]
+        for x in range(width):
+            beside = above[x] | above[x + 1] | above[x + 2] | below[x] | below[x + 1] | below[x + 2]
+            kept[x] = here[x + 1] & (beside | here[x] | here[x + 2])
+    return out
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def widen(mask: Any) -> Any:
     """A mask of 0 and 1 with as many columns of BESIDE as make its width a multiple of CHUNK.
 

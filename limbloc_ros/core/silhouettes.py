@@ -23,7 +23,6 @@ from limbloc_ros.core.lens import lens_range
 ROOT = 32
 #: A blob is a speck when the largest one has so many times its area; a lone pixel's area, as contours give it.
 SMALL_BLOB, LONE_AREA = 200.0, 0.5
-_NEIGHBOURS = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], np.uint8)
 
 
 @dataclass(frozen=True)
@@ -234,16 +233,17 @@ def cleaned(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 def _cleaned_piece(mask: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], int, int]:
     """The smallest part of the cleaned mask that holds all its foreground, and its first column and row."""
-    x, y, width, height = cv2.boundingRect(mask)
+    mask = np.require(mask, np.uint8, ["C", "W"])  # whatever it is: the kernels are compiled for one kind
+    x, y, width, height = kernels.bounds(mask)
     if width == 0:
         return np.zeros((0, 0), np.uint8), x, y
-    every = np.not_equal(mask[y : y + height, x : x + width], 0).view(np.uint8)
     # Most specks are lone pixels: dropped at once, where the largest blob is large enough, which nearly always is so.
-    rest, left, top = _outlined(every & np.asarray(cv2.dilate(every, _NEIGHBOURS), np.uint8), x, y)
+    rest, left, top = _outlined(kernels.without_lone_pixels(mask, x, y, width, height), x, y)
     if rest.size:
         largest, dropped = _drop_small(rest)
         if largest > SMALL_BLOB * LONE_AREA:
             return _outlined(rest, left, top) if dropped else (rest, left, top)
+    every = np.not_equal(mask[y : y + height, x : x + width], 0).view(np.uint8)
     _drop_small(every)
     return _outlined(every, x, y)
 
@@ -371,7 +371,7 @@ def measure_silhouettes(
 
 def _outlined(mask: NDArray[np.uint8], left: int, top: int) -> tuple[NDArray[np.uint8], int, int]:
     """The smallest rectangle around the foreground of a mask whose first pixel is (left, top), and its first pixel."""
-    x, y, width, height = cv2.boundingRect(mask)
+    x, y, width, height = kernels.bounds(np.ascontiguousarray(mask))
     return mask[y : y + height, x : x + width], left + x, top + y
 
 
