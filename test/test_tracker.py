@@ -213,11 +213,12 @@ def stand(monkeypatch):
 
 
 def test_calm_frames_are_followed_and_each_limb_checked_now_and_then(stand):
-    stand.run(Tracker(seed=0), 13)
+    turn = Tracker.TURN
+    stand.run(Tracker(seed=0), 6 * turn)
     assert stand.search_frames == [1]
-    assert [frame for frame, *_ in stand.refined] == list(range(2, 14))
+    assert [frame for frame, *_ in stand.refined] == list(range(2, 6 * turn + 1))
     in_turn = ALL_LIMBS + ALL_LIMBS[:2]
-    assert stand.checked == [(frame, [limb]) for frame, limb in zip(range(2, 14, 2), in_turn, strict=True)]
+    assert stand.checked == [(turn * n, [limb]) for n, limb in enumerate(in_turn, start=1)]
 
 
 def test_all_limbs_are_checked_at_once_when_the_cost_rises_and_ever_less_often_in_vain(stand, monkeypatch):

@@ -59,7 +59,7 @@ class Tracker:
     )  # fmt: skip
     #: Every so many frames one of the limbs has its turn to be looked for elsewhere, in so many places; by how much of
     #: the energy it and what the silhouettes add must be lower there.
-    TURN, PLACES, LIMB_GAIN = 2, 1, 0.03
+    TURN, PLACES, LIMB_GAIN = 3, 1, 0.03
     #: When the cost is so much above the usual one, the figure is first carried on by so many steps, and then all limbs
     #: are checked at once; each time in vain, the wait doubles, up to this, unless the cost rises as much once more.
     LIMB_DOUBT, MORE_STEPS, LONGEST_DOUBT = 1.25, 10, 8
@@ -68,7 +68,7 @@ class Tracker:
     SAME_PLACE_M, SETTLED_M = 0.05, 0.03
     #: The figure is carried along with the firm weights of the search, which lead from further off; so many more steps
     #: with the final ones put its joints in their places.
-    FINAL_STEPS = 6
+    FINAL_STEPS = 4
     #: People do not change their size, and one hull says little of it: what a squared deviation from the mean shape so
     #: far costs (m^2) per frame in that mean, and how many frames count.
     SIZE_WEIGHT, REMEMBERED = 1e-4, 20
