@@ -7,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from limbloc_ros.core import _background_kernels as kernels
+from limbloc_ros.core._bit_kernels import at_least, no_pixels, spread
 
 
 def measured(image, mean, variance, gain=(1, 1, 1), floor=2.0, darkest=0.5, brightest=1.0):
@@ -19,11 +20,13 @@ def measured(image, mean, variance, gain=(1, 1, 1), floor=2.0, darkest=0.5, brig
     height, width = image.shape[:2]
     change, colour = np.empty((2, height, width), dtype=np.uint8)
     spans = np.tile(np.array([0, width], dtype=np.int32), (height, 1))
-    kernels.measure(
-        np.ascontiguousarray(image.transpose(2, 0, 1)), level, sharpness, np.array(gain, dtype=f), f(darkest),
-        f(brightest), spans, change, colour,
-    )  # fmt: skip
+    light = np.array(gain, dtype=f), f(darkest), f(brightest)
+    kernels.measure(image, level, sharpness, *light, 0, 0, spans, change, colour)
     return change / kernels.CHANGE_SCALE, colour / kernels.COLOUR_SCALE
+
+
+def packed(mask):
+    return at_least(mask.astype(np.uint8), 1)
 
 
 class TestPixels:
@@ -73,7 +76,7 @@ class TestKernels:
 
     def test_measure(self):
         rng = np.random.default_rng(1)
-        shape = (37, 700, 3)  # more than two strips wide
+        shape = (37, 700, 3)  # ten words of pixels and a part of one
         image = rng.integers(0, 256, shape, dtype=np.uint8)
         mean, variance = rng.uniform(0, 255, shape), rng.uniform(0, 400, shape)
         gain = np.array([0.9, 1.0, 1.2])
@@ -88,60 +91,90 @@ class TestKernels:
         assert np.abs(change - np.minimum(far, 127.5)).max() < 1.5 * unit[0]
         assert np.abs(colour - np.minimum(rest, 255 * unit[1])).max() < 1.5 * unit[1]
 
-    def test_only_spans_are_measured(self):
-        rng = np.random.default_rng(3)
-        shape = (3, 20, 700)
-        image = rng.integers(0, 256, shape, dtype=np.uint8)
-        level = rng.integers(0, 32000, shape, dtype=np.uint16)
-        sharpness = rng.integers(100, 2000, shape, dtype=np.uint16)
-        light = np.ones(3, dtype=np.float32), np.float32(0.5), np.float32(1.1)
+    def frame(self, shape, seed=3):
+        """An image and a background that have nothing to do with each other, as the kernels take them."""
+        rng = np.random.default_rng(seed)
+        image = rng.integers(0, 256, (*shape, 3), dtype=np.uint8)
+        level = rng.integers(0, 32000, (3, *shape), dtype=np.uint16)
+        sharpness = rng.integers(100, 2000, (3, *shape), dtype=np.uint16)
+        return image, level, sharpness, np.ones(3, dtype=np.float32)
+
+    def test_only_spans_are_measured_in_whole_words(self):
+        frame = *self.frame((20, 700)), np.float32(0.5), np.float32(1.1)
         everywhere = np.tile(np.array([0, 700], dtype=np.int32), (20, 1))
-        some = everywhere.copy()
-        some[3:9], some[9:] = (5, 420), (700, 0)
-        whole, part = np.zeros((2, 2, 20, 700), dtype=np.uint8)
-        kernels.measure(image, level, sharpness, *light, everywhere, *whole)
-        kernels.measure(image, level, sharpness, *light, some, *part)
-        columns = np.arange(700)
-        inside = (columns >= some[:, :1]) & (columns < some[:, 1:])
-        np.testing.assert_array_equal(part, np.where(inside, whole, 0))
+        whole = np.zeros((2, 20, 700), dtype=np.uint8)
+        kernels.measure(*frame, 0, 0, everywhere, *whole)
+        spans = np.tile(np.array([700, 0], dtype=np.int32), (12, 1))
+        spans[2:5], spans[5:7] = (70, 420), (650, 700)
+        part = np.zeros((2, 12, 636), dtype=np.uint8)  # of the image from row 5 and column 64 on
+        kernels.measure(*frame, 5, 64, spans, *part)
+        inside = np.zeros((12, 700), dtype=bool)
+        inside[2:5, 64:448] = inside[5:7, 640:] = True
+        np.testing.assert_array_equal(part, np.where(inside, whole[:, 5:17], 0)[:, :, 64:])
+
+    def test_looking_tells_the_pixels_that_are_far(self):
+        frame = self.frame((23, 150))
+        changed = np.zeros((6, 3), dtype=np.uint64)
+        count = kernels.look(*frame, 2, 4, np.float32(60), changed)
+        change = np.zeros((2, 23, 150), dtype=np.uint8)
+        everywhere = np.tile(np.array([0, 150], dtype=np.int32), (23, 1))
+        kernels.measure(*frame, np.float32(0.5), np.float32(1.1), 0, 0, everywhere, *change)
+        expected = change[0, 2::4] >= 60 * kernels.CHANGE_SCALE
+        assert 0.2 < expected.mean() < 0.8
+        np.testing.assert_array_equal(spread(changed, 150) > 0, expected)
+        assert count == np.count_nonzero(expected)
 
     def test_spans_of_foreground_by_hand(self):
-        change, colour = np.zeros((2, 40, 60), dtype=np.uint8)
-        change[8, 20:23] = colour[8, 20:23] = 50
-        change[9, 40:50] = colour[9, 40:50] = 50  # a row that is not looked at
-        change[16, 30] = colour[16, 30] = 50  # a single pixel: noise
-        change[24, 30:40] = 50  # a shadow
+        background = np.full((40, 200, 3), 100, dtype=np.uint8)
+        image = background.copy()
+        other, shadow = (100, 140, 60), (80, 80, 80)
+        image[8, 70:73] = other
+        image[9, 140:150] = other  # a row that is not looked at
+        image[16, 130] = other  # a single pixel: noise
+        image[24, 30:40] = shadow
+        image[32, 10:190] = shadow
+        image[32, 50:60] = image[32, 66:69] = image[32, 188:190] = other
+        level, sharpness = np.empty((2, 3, 40, 200), dtype=np.uint16)
+        mean = np.ascontiguousarray(background.transpose(2, 0, 1), dtype=np.float32)
+        kernels.fix_all(mean, np.zeros_like(mean), np.float32(4), np.float32(1), level, sharpness)
+        frame = image, level, sharpness, np.ones(3, dtype=np.float32)
+        changed = np.zeros((10, 4), dtype=np.uint64)
+        kernels.look(*frame, 0, 4, np.float32(4), changed)
         spans = np.empty((40, 2), dtype=np.int32)
-        kernels.foreground_spans(change, 8, colour, 16, 0, 4, 5, spans)
-        assert (spans[3:14] == (15, 28)).all()
-        assert (spans[:3] == (60, 0)).all()
-        assert (spans[14:] == (60, 0)).all()
+        light = np.float32(0.5), np.float32(1.1)
+        kernels.foreground_spans(*frame, *light, changed, 16, 0, 4, 5, spans)
+        assert (spans[3:14] == (65, 78)).all()
+        assert (spans[27:38] == (45, 195)).all()
+        assert (np.delete(spans, [*range(3, 14), *range(27, 38)], axis=0) == (200, 0)).all()
+        assert kernels.box_of(spans, 2, 200) == (1, 40, 0, 200)
+        assert kernels.box_of(spans[:20], 1, 200) == (2, 15, 64, 128)
+        assert kernels.box_of(spans[:3], 2, 200) == (0, 0, 0, 0)
 
     def test_learn(self):
         rng = np.random.default_rng(2)
-        shape = (3, 24, 50)
-        image = rng.integers(0, 256, shape, dtype=np.uint8)
+        shape = (3, 24, 70)
+        image = rng.integers(0, 256, (24, 70, 3), dtype=np.uint8)
+        planes = image.transpose(2, 0, 1)
         mean, variance = rng.uniform(0, 255, shape).astype(np.float32), rng.uniform(0, 99, shape).astype(np.float32)
-        busy = (rng.random(shape[1:]) < 0.3).astype(np.uint8)
-        change = rng.integers(0, 20, shape[1:], dtype=np.uint8)
+        busy, changed = rng.random((24, 70)) < 0.3, rng.random((12, 70)) < 0.3
         gain = np.array([0.8, 1.0, 1.1], dtype=np.float32)
         level, sharpness = np.zeros(shape, dtype=np.uint16), np.zeros(shape, dtype=np.uint16)
         rows = np.zeros(shape[1:], dtype=bool)
-        rows[1::4] = True
-        may = (busy == 0) & (change < 8) & rows & (image < 254)
-        off = image / gain[:, None, None] - mean
+        rows[5::6] = True  # of the rows 1, 3, 5 ... that were looked at every third, from number 2 on
+        may = ~busy & ~np.repeat(changed, 2, axis=0) & rows & (planes < 254)
+        off = planes / gain[:, None, None] - mean
         new_mean = np.where(may, mean + 0.1 * off, mean)
         new_variance = np.where(may, 0.9 * (variance + 0.1 * off**2), variance)
         f = np.float32
         kernels.learn(
-            image, mean, variance, level, sharpness, gain, busy, change, f(8), f(0.1), f(4), f(1), 1, 4
+            image, mean, variance, level, sharpness, gain, packed(busy), packed(changed), f(0.1), f(4), f(1), 1, 2, 2, 3
         )  # fmt: skip
         np.testing.assert_allclose(mean, new_mean, rtol=1e-5, atol=1e-3)
         np.testing.assert_allclose(variance, new_variance, rtol=1e-4, atol=1e-2)
-        assert np.abs(level[:, 1::4] / kernels.LEVEL_SCALE - new_mean[:, 1::4]).max() < 0.6 / kernels.LEVEL_SCALE
-        sigma = np.sqrt(new_variance + 4)[:, 1::4]
-        assert np.abs(sharpness[:, 1::4] - kernels.SHARPNESS_SCALE / sigma).max() < 0.6
-        assert not level[:, 0::4].any()
+        assert np.abs(level[:, 5::6] / kernels.LEVEL_SCALE - new_mean[:, 5::6]).max() < 0.6 / kernels.LEVEL_SCALE
+        sigma = np.sqrt(new_variance + 4)[:, 5::6]
+        assert np.abs(sharpness[:, 5::6] - kernels.SHARPNESS_SCALE / sigma).max() < 0.6
+        assert not level[:, 0::6].any()
 
     def test_images_are_taken_into_mean_and_variance(self):
         images = np.random.default_rng(4).integers(0, 256, (6, 3, 20, 33), dtype=np.uint8)
@@ -161,15 +194,23 @@ class TestKernels:
         image = np.clip(np.rint(mean * np.array(gain)[:, None, None] + rng.normal(0, 1.5, mean.shape)), 0, 255)
         image[:, 10:50, 20:45] = 30  # a fifth of the image, unknown to the model
         level = np.rint(mean * kernels.LEVEL_SCALE).astype(np.uint16)
-        nobody = np.zeros((60, 80), dtype=np.uint8)
-        found = kernels.light_gain(image.astype(np.uint8), level, nobody, np.ones(3, dtype=np.float32), 2)
+        image = np.ascontiguousarray(image.transpose(1, 2, 0), dtype=np.uint8)
+        found = kernels.light_gain(image, level, no_pixels(60, 80), np.ones(3, dtype=np.float32), 2)
         np.testing.assert_allclose(found, gain, rtol=0.02)
 
+    def test_light_gain_leaves_out_who_is_known_to_be_there(self):
+        image = np.full((60, 80, 3), 100, dtype=np.uint8)
+        level = np.full((3, 60, 80), 100 * kernels.LEVEL_SCALE, dtype=np.uint16)
+        busy = np.zeros((60, 80), dtype=bool)
+        busy[:, :50] = True
+        image[busy] = 60  # five eighths of the image
+        found = kernels.light_gain(image, level, packed(busy), np.ones(3, dtype=np.float32), 2)
+        np.testing.assert_allclose(found, 1, rtol=1e-3)
+
     def test_light_gain_keeps_the_last_one_in_the_dark(self):
-        black = np.zeros((3, 40, 40), dtype=np.uint8)
+        black, level = np.zeros((40, 40, 3), dtype=np.uint8), np.zeros((3, 40, 40), dtype=np.uint16)
         last = np.array([0.7, 0.8, 0.9], dtype=np.float32)
-        nobody = np.zeros((40, 40), dtype=np.uint8)
-        found = kernels.light_gain(black, black.astype(np.uint16), nobody, last, 1)
+        found = kernels.light_gain(black, level, no_pixels(40, 40), last, 1)
         np.testing.assert_array_equal(found, last)
 
     def test_densest_mean_finds_the_crowd(self):

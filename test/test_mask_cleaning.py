@@ -9,15 +9,24 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from limbloc_ros.core import _bit_kernels as bits
 from limbloc_ros.core import _mask_kernels as kernels
-from limbloc_ros.core import background
-from limbloc_ros.core._background_kernels import CHANGE_SCALE, COLOUR_SCALE
+from limbloc_ros.core import background, background_evidence
+from limbloc_ros.core._background_kernels import CHANGE_SCALE, COLOUR_SCALE, learn, look, measure
 from limbloc_ros.core.config import BackgroundConfig
 from limbloc_ros.core.mask_cleaning import clean_mask
 
 
 def iou(a, b):
     return np.count_nonzero(a & b) / np.count_nonzero(a | b)
+
+
+def packed(mask):
+    return bits.at_least(np.asarray(mask).astype(np.uint8), 1)
+
+
+def unpacked(mask, like):
+    return bits.spread(mask, like.shape[1]) > 0
 
 
 def speckles(seed, share=0.45):
@@ -30,38 +39,32 @@ def speckles(seed, share=0.45):
 class TestKernels:
     """Compiled loops on runs against OpenCV's on pixels."""
 
-    @given(st.integers(0, 1000), st.sampled_from([8, 16, 33, 640]), st.integers(1, 30), st.integers(1, 30))
+    @given(st.integers(0, 1000), st.sampled_from([0.05, 0.5, 0.95]))
     @settings(max_examples=25, deadline=None)
-    def test_most_of_nine_is_the_median(self, seed, width, far, coloured):
-        change, colour = np.random.default_rng(seed).integers(0, 30, (2, 20, width), dtype=np.uint8)
-        found = np.empty_like(change)
-        kernels.mostly_at_least(change, far, colour, coloured, found)
-        expected = (cv2.medianBlur(change, 3) >= far) & (cv2.medianBlur(colour, 3) >= coloured)
-        expected[[0, -1]] = expected[:, [0, -1]] = False
-        np.testing.assert_array_equal(found, expected * np.uint8(255))
-
-    @given(st.integers(0, 1000), st.sampled_from([0.05, 0.5, 0.95]), st.sampled_from([0, 255]))
-    @settings(max_examples=25, deadline=None)
-    def test_runs_are_the_mask(self, seed, share, wanted):
+    def test_runs_are_the_mask(self, seed, share):
         mask = speckles(seed, share)
-        mask[10:14] = wanted
-        runs = kernels.runs_of(mask, wanted)
+        mask[10:14] = 255
+        runs = bits.runs_of(packed(mask), mask.shape[1])
         painted = np.zeros_like(mask)
-        kernels.paint(painted, runs)
-        np.testing.assert_array_equal(painted > 0, mask == wanted)
-        ends = runs[:, kernels.END]
-        assert (runs[:, kernels.START] < ends).all()
-        rows, ends = runs[ends < mask.shape[1], kernels.ROW], ends[ends < mask.shape[1]]
-        assert (mask[rows, ends] != wanted).all()  # no run goes on
+        for row, start, end in runs:
+            painted[row, start:end] = 255
+        np.testing.assert_array_equal(painted, mask)
+        rows, ends = runs[runs[:, bits.END] < mask.shape[1]][:, [bits.ROW, bits.END]].T
+        assert (mask[rows, ends] == 0).all()  # no run goes on
+        again = bits.no_pixels(*mask.shape)
+        bits.set_runs(again, runs)
+        np.testing.assert_array_equal(again, packed(mask))
+        bits.clear_runs(again, runs)
+        assert not again.any()
 
     @given(st.integers(0, 1000), st.booleans())
     @settings(max_examples=25, deadline=None)
     def test_parts_are_the_connected_components(self, seed, diagonal):
         mask = speckles(seed)
-        runs = kernels.runs_of(mask, 255)
+        runs = bits.runs_of(packed(mask), mask.shape[1])
         parts = kernels.parts_of(runs, diagonal)
         _, labels = cv2.connectedComponents(mask, connectivity=8 if diagonal else 4)
-        found = labels[runs[:, kernels.ROW], runs[:, kernels.START]]
+        found = labels[runs[:, bits.ROW], runs[:, bits.START]]
         same = found[:, None] == found
         np.testing.assert_array_equal(parts[:, None] == parts, same)
         np.testing.assert_array_equal(parts, same.argmax(axis=1))  # the first run of each
@@ -70,13 +73,12 @@ class TestKernels:
     @settings(max_examples=25, deadline=None)
     def test_hysteresis_keeps_whole_parts(self, seed):
         weak = speckles(seed)
-        colour = cv2.blur(np.random.default_rng(seed).integers(0, 256, weak.shape, dtype=np.uint8), (3, 3))
-        strong = (weak > 0) & (cv2.medianBlur(colour, 3) >= 150)
+        strong = np.random.default_rng(seed).random(weak.shape) < 0.02
         _, labels = cv2.connectedComponents(weak, connectivity=8)
         kept = np.isin(labels, np.unique(labels[strong])) & (weak > 0)
-        found = np.zeros_like(weak)
-        kernels.paint(found, kernels.strong_parts(weak, colour, 150))
-        np.testing.assert_array_equal(found > 0, kept)
+        found = packed(weak)
+        kernels.keep_strong_parts(found, packed(strong), weak.shape[1])
+        np.testing.assert_array_equal(unpacked(found, weak), kept)
 
     @given(st.integers(0, 1000), st.integers(1, 40))
     @settings(max_examples=25, deadline=None)
@@ -86,31 +88,63 @@ class TestKernels:
         blobs = (mask > 0) & (stats[labels, cv2.CC_STAT_AREA] >= least)
         _, labels, stats, _ = cv2.connectedComponentsWithStats(255 - mask, connectivity=4)
         holes = (mask == 0) & (stats[labels, cv2.CC_STAT_AREA] < least) & (labels != labels[0, 0])
-        erased, filled, nothing = mask.copy(), mask.copy(), np.zeros_like(mask)
-        kernels.erase_blobs(erased, least)
-        kernels.fill_holes(filled, nothing, nothing, 8, 10.0, least)
-        np.testing.assert_array_equal(erased > 0, blobs)
-        np.testing.assert_array_equal(filled > 0, (mask > 0) | holes)
+        erased, filled = packed(mask), packed(mask)
+        kernels.erase_blobs(erased, mask.shape[1], least)
+        kernels.fill_holes(filled, np.zeros_like(filled), np.zeros_like(mask), 10.0, least)
+        np.testing.assert_array_equal(unpacked(erased, mask), blobs)
+        np.testing.assert_array_equal(unpacked(filled, mask), (mask > 0) | holes)
+
+    @given(st.integers(0, 1000), st.floats(0.05, 0.95))
+    @settings(max_examples=25, deadline=None)
+    def test_the_outline_is_trimmed_where_the_change_is_small(self, seed, fraction):
+        mask = speckles(seed, 0.7)
+        change = np.random.default_rng(seed).integers(0, 256, mask.shape, dtype=np.uint8)
+        core = cv2.erode(mask, np.ones((5, 5), np.uint8))
+        units = round(fraction * kernels.FRACTION)
+        tallest = cv2.dilate(change & mask, np.ones((5, 5), np.uint8)).astype(int)
+        enough = change >= (tallest * units + kernels.FRACTION // 2) // kernels.FRACTION
+        found = packed(mask)
+        kernels.trim(found, packed(core), change, units)
+        np.testing.assert_array_equal(unpacked(found, mask), (mask > 0) & ((core > 0) | enough))
 
     def test_body_parts_by_hand(self):
         mask = np.zeros((12, 12), dtype=np.uint8)
         mask[2:10, 2:10] = 255
         mask[4:6, 4:6] = 0  # a hole: 8 border pixels' worth beside the mask, none beside background
         mask[9, 6] = 0  # a notch: three sides mask, one background
-        changed = np.where(mask > 0, 50, 0).astype(np.uint8)
-        changed[4:6, 4:6] = 30
-        changed[9:11, 6] = 30  # the notch and one pixel that sticks out below it
+        changed = mask > 0
+        changed[4:6, 4:6] = True
+        changed[9:11, 6] = True  # the notch and one pixel that sticks out below it
         colour = np.full_like(mask, 20)
 
-        def added(colour, ratio):
-            out = mask.copy()
-            kernels.add_body_parts(out, changed, colour, 8, 10.0, ratio)
-            return sorted(zip(*np.nonzero(out != mask), strict=True))
+        def added(colour, ratio, box=(0, 11, 0, 11)):
+            out = packed(mask)
+            kernels.add_body_parts(out, packed(changed), colour, 10.0, ratio, box)
+            return sorted(zip(*np.nonzero(unpacked(out, mask) != (mask > 0)), strict=True))
 
         hole = [(4, 4), (4, 5), (5, 4), (5, 5)]
         assert added(colour, 0.7) == [*hole, (9, 6), (10, 6)]  # 1 pixel beside the mask, 1 beside background
         assert added(colour, 1.0) == hole
+        assert added(colour, 0.7, (0, 10, 0, 11)) == hole  # it reaches the rim of the box
+        assert kernels.box_around(packed(mask), 12, 1) == (1, 10, 1, 10)
         assert added(np.zeros_like(mask), 0.7) == []  # the background's very colour: a shadow
+
+    @pytest.mark.parametrize(("top", "left", "width"), [(3, 64, 64), (0, 0, 128), (3, 64, 76), (0, 0, 140)])
+    def test_a_part_is_placed_and_the_outermost_pixels_follow(self, top, left, width):
+        part = (np.random.default_rng(top).random((20, width)) < 0.1).astype(np.uint8) * 255
+        expected = np.zeros((40, 140), dtype=np.uint8)
+        expected[top : top + 20, left : left + width] = part
+        expected[0], expected[-1] = expected[1], expected[-2]
+        expected[:, 0], expected[:, -1] = expected[:, 1], expected[:, -2]
+        inside = np.zeros_like(expected)
+        inside[top : top + 20, left : left + width] = 255
+        mask, busy = np.zeros_like(expected), bits.no_pixels(40, 140)
+        square = np.full(5, 2, dtype=np.int32)
+        count = kernels.place(packed(part), top, left, square, mask, busy)
+        np.testing.assert_array_equal(mask, expected)
+        assert count == np.count_nonzero(expected)
+        around = cv2.dilate(expected, np.ones((5, 5), np.uint8)) & inside
+        np.testing.assert_array_equal(bits.spread(busy, 140), around)
 
 
 class TestCleaning:
@@ -125,7 +159,8 @@ class TestCleaning:
         self.colour[rows, columns] = colour_sigmas * COLOUR_SCALE
 
     def mask(self, **kwargs):
-        return clean_mask(self.change, self.colour, BackgroundConfig(**kwargs)) > 0
+        found = clean_mask(self.change, self.colour, BackgroundConfig(**kwargs), 1.0)
+        return bits.spread(found, 640) > 0
 
     def test_small_blobs_go_and_large_ones_stay(self):
         self.draw(slice(100, 110), slice(100, 110))
@@ -179,15 +214,30 @@ class TestCleaning:
     def test_a_body_at_the_image_border_reaches_it(self):
         self.draw(slice(300, 480), slice(0, 60))
         mask = self.mask()
-        assert mask[479, 10:50].all()
-        assert mask[310:470, 0].all()
+        assert mask[478, 10:50].all()
+        assert mask[310:470, 1].all()
 
 
 def test_the_warm_up_leaves_no_kernel_to_be_compiled_for_the_first_person(monkeypatch):
     """As it was when nothing in its images was foreground: the first person was not seen for ten seconds."""
     used = set()
-    for name in ("mostly_at_least", "strong_parts", "paint", "add_body_parts", "fill_holes", "erase_blobs"):
-        kernel = getattr(kernels, name)
-        monkeypatch.setattr(kernels, name, lambda *args, n=name, k=kernel: (used.add(n), k(*args))[1])
+    wanted = {"measure", "silhouette", "place", "learn", "light_gain", "look", "foreground_spans"}
+    for module in (background, background_evidence, kernels):
+        for name in wanted & set(vars(module)):
+            kernel = getattr(module, name)
+            monkeypatch.setattr(module, name, lambda *args, n=name, k=kernel: (used.add(n), k(*args))[1])
     background.warm_up.__wrapped__()
-    assert used == {"mostly_at_least", "strong_parts", "paint", "add_body_parts", "fill_holes", "erase_blobs"}
+    assert used == wanted
+
+
+def test_the_warm_up_compiles_what_images_of_messages_need():
+    """Pixels of messages are read-only, those of files are not: a kernel is compiled for one kind of array only."""
+    background.warm_up()
+    before = [len(kernel.signatures) for kernel in (look, measure, learn)]
+    for writeable in (True, False):
+        model = background.BackgroundModel(BackgroundConfig(learning_frames=1))
+        for level in (100, 102):
+            image = np.full((64, 64, 3), level, dtype=np.uint8)
+            image.flags.writeable = writeable
+            model.segment(image)
+    assert [len(kernel.signatures) for kernel in (look, measure, learn)] == before

@@ -28,9 +28,23 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from limbloc_ros.core._background_kernels import add_to_mean, fix_all, learn, light_gain
+from limbloc_ros.core._background_kernels import add_to_mean, fix_all, learn
+from limbloc_ros.core._bit_kernels import no_pixels, spread
+from limbloc_ros.core._mask_kernels import place
 from limbloc_ros.core.background_estimate import BackgroundEstimate, estimate_background, fixed_levels, noise_variance
-from limbloc_ros.core.background_evidence import change_level, measure_evidence
+from limbloc_ros.core.background_evidence import (
+    LOOKED_ROWS,
+    Background,
+    Evidence,
+    Look,
+    at_working_size,
+    change_level,
+    light_of,
+    look_at,
+    measure_evidence,
+    planes_of,
+    scale_of,
+)
 from limbloc_ros.core.config import BackgroundConfig, validated
 from limbloc_ros.core.errors import InputError
 from limbloc_ros.core.mask_cleaning import clean_mask
@@ -65,7 +79,7 @@ RESTLESS_SIGMA, UNREST = 10.0, 0.005
 such pixels from which on somebody must have moved. Empty rooms had none, rooms with somebody who walks 3 to 20 %."""
 
 _ONES = np.ones(3, dtype=np.float32)
-_RIM = np.ones((5, 5), dtype=np.uint8)
+_RIM = np.full(5, 2, dtype=np.int32)
 
 
 class BackgroundModel:
@@ -91,9 +105,8 @@ class BackgroundModel:
         self._level = np.zeros(self._mean.shape, dtype=np.uint16)
         self._sharpness = self._level.copy()
         self._gain = _ONES
-        self._busy = np.zeros((0, 0), dtype=np.uint8)
-        self._changed = self._busy
-        self._evidence = np.zeros((2, 0, 0), dtype=np.uint8)
+        self._busy = no_pixels(0, 0)
+        self._before: Evidence | None = None  # of the last image that was not doubted
         self._share, self._doubts = 0.0, 0
         self._fresh = True  # no image has been segmented yet: somebody may be there whom we never saw
         self._learned = 0
@@ -177,18 +190,18 @@ class BackgroundModel:
     def seed_estimate(self, estimate: BackgroundEstimate) -> None:
         """Start from `estimate_background`; its noise is a lower bound, the rest comes from the first image."""
         self.recapture()
-        planes = self._working(np.clip(np.rint(estimate.mean), 0, 255).astype(np.uint8))
-        size = (planes.shape[2], planes.shape[1])
+        image = self._working(np.clip(np.rint(estimate.mean), 0, 255).astype(np.uint8))
+        size = (image.shape[1], image.shape[0])
         for c in range(3):
             mean, sigma = (np.ascontiguousarray(a[..., c], dtype=np.float32) for a in (estimate.mean, estimate.sigma))
             planes_c = (mean, sigma * sigma)
-            if mean.shape != planes.shape[1:]:
+            if mean.shape != image.shape[:2]:
                 planes_c = (
                     cv2.resize(mean, size, interpolation=cv2.INTER_AREA),
                     cv2.resize(sigma * sigma, size, interpolation=cv2.INTER_AREA),
                 )
             if c == 0:
-                self._allocate(planes)
+                self._allocate(planes_of(image))
             self._mean[c], self._variance[c] = planes_c
         self._learned = 1
         self._ready = True
@@ -236,7 +249,7 @@ class BackgroundModel:
         self._forget()
         self._mean, self._variance, self._gain, self._image_shape = mean, variance, gain, (height, width)
         self._grey, self._noise_known, self._frozen = flags
-        self._busy = self._changed = np.zeros(mean.shape[1:], dtype=np.uint8)
+        self._busy = no_pixels(*mean.shape[1:])
         self._learned, self._ready = learned, True
         self._fix_model()
 
@@ -253,41 +266,42 @@ class BackgroundModel:
         Raises:
             InputError: not an 8-bit image, or another size than before (`recapture` accepts a new size).
         """
-        planes = self._working(image)
-        if not self._ready and shows_nothing(planes, None):
+        image = self._working(image)
+        if not self._ready and shows_nothing(image, None):
             return self._no_mask(blind=True)
-        if not self._ready and not self._recall(planes, FITS):
-            self._learn(planes)
+        if not self._ready and not self._recall(image, FITS):
+            self._learn(image)
             if self._learned >= self._config.learning_frames:
                 self._finish_learning()
             return self._no_mask()
-        last, self._gain = self._gain, light_gain(planes, self._level, self._busy, self._gain, self._stride())
+        last, self._gain = self._gain, light_of(image, self._level, self._busy, self._gain)
         if not self._noise_known:
-            self._estimate_noise(planes)
-        change, colour = self._measure(planes)
-        far, share = self._far(change)
-        if share > FITS and shows_nothing(planes, self._mean):
+            self._estimate_noise(image)
+        looked = self._look(image)
+        if looked.share > FITS and shows_nothing(image, self._mean):
             return self._no_mask(blind=True)
-        if share > self._config.relearn_fraction:
-            moved = self._light_jumped(planes)
+        if looked.share > self._config.relearn_fraction:
+            moved = self._light_jumped(image)
             if moved is not None:
                 return self._no_mask(light_jump=True, moved=moved)
-        switched = float(np.abs(np.log(self._gain / last)).max()) > SWITCHED and self._recall(planes, 0.8 * share)
-        if switched or share > self._config.relearn_fraction or self._partly_jumped(planes, far, share):
-            change, colour = self._measure(planes)
-            far, share = self._far(change)
+        switched = float(np.abs(np.log(self._gain / last)).max()) > SWITCHED and self._recall(image, 0.8 * looked.share)
+        if switched or looked.share > self._config.relearn_fraction or self._partly_jumped(image, looked):
+            looked = self._look(image)
         self._upset, self._fresh = 0, False
+        evidence = self._measure(image, looked)
         if not self._doubts:
-            self._changed, self._share = far, share
-        mask = clean_mask(change, colour, self._config)
-        self._busy = cv2.dilate(mask, _RIM)
+            self._before, self._share = evidence, looked.share
+        mask, self._busy, count = np.zeros(image.shape[:2], dtype=np.uint8), no_pixels(*image.shape[:2]), 0
+        if evidence.change.size:
+            part = clean_mask(evidence.change, evidence.colour, self._config, scale_of(mask.size))
+            count = place(part, evidence.top, evidence.left, _RIM, mask, self._busy)
         if not self._frozen and self._config.learning_rate > 0:
-            self._follow(planes, change)
-        fraction, gain = cv2.countNonZero(mask) / mask.size, tuple(map(float, self._gain))
+            self._follow(image, looked)
+        fraction, gain = count / mask.size, tuple(map(float, self._gain))
         return Segmentation(self._full_size(mask), False, self._learned, fraction, False, gain)
 
     def _working(self, image: Bytes) -> Bytes:
-        """Check an image and bring it to planar [3, h, w] at working size."""
+        """Check an image and bring it to [h, w, 3] at working size."""
         if not isinstance(image, np.ndarray) or image.dtype != np.uint8:
             kind = getattr(image, "dtype", type(image).__name__)
             raise InputError(f"expected an image as uint8 array, got {kind}; convert it to 8 bits per channel first")
@@ -306,15 +320,7 @@ class BackgroundModel:
             )
         if image.ndim == 2:
             image = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
-        height, width = image.shape[:2]
-        factor = 1
-        while (height // factor) * (width // factor) > self._config.max_pixels:
-            factor *= 2
-        if factor > 1:
-            image = cv2.resize(image, (width // factor, height // factor), interpolation=cv2.INTER_AREA)
-        planes = np.empty((3, *image.shape[:2]), dtype=np.uint8)
-        cv2.split(image, [planes[0], planes[1], planes[2]])
-        return planes
+        return at_working_size(image, self._config.max_pixels)
 
     def _full_size(self, mask: Bytes) -> Bytes:
         assert self._image_shape is not None
@@ -323,10 +329,6 @@ class BackgroundModel:
             return mask
         smooth = cv2.resize(mask, (width, height), interpolation=cv2.INTER_LINEAR)
         return np.asarray(cv2.threshold(smooth, 127, 255, cv2.THRESH_BINARY)[1], dtype=np.uint8)
-
-    def _stride(self) -> int:
-        """Sampling of the gain: about 1500 pixels whatever the image's size."""
-        return max(1, int(np.sqrt(self._mean[0].size / 1500.0)))
 
     def _no_mask(self, light_jump: bool = False, moved: bool = False, blind: bool = False) -> Segmentation:
         assert self._image_shape is not None
@@ -338,17 +340,17 @@ class BackgroundModel:
         self._variance = np.zeros_like(self._mean)
         # Told by the first image that is learned: many a camera begins with black ones.
         self._grey = bool((np.ptp(planes[:, ::4, ::4].astype(np.int16), axis=0) <= 2).all())
-        self._busy = self._changed = np.zeros(planes.shape[1:], dtype=np.uint8)
+        self._busy = no_pixels(*planes.shape[1:])
         self._learned = 1
 
-    def _learn(self, planes: Bytes) -> None:
+    def _learn(self, image: Bytes) -> None:
         """Add one person-free image: running mean and sum of squares (Welford) under the first image's light."""
+        planes = planes_of(image)
         if self._learned == 0:
             self._allocate(planes)
             return
-        some = (slice(None), *2 * (slice(self._stride() // 2, None, self._stride()),))
-        now, mean = np.ascontiguousarray(planes[some]), fixed_levels(self._mean[some])
-        gain = light_gain(now, mean, np.zeros(now.shape[1:], dtype=np.uint8), _ONES, 1)
+        nobody = no_pixels(*image.shape[:2])
+        gain = light_of(image, fixed_levels(self._mean), nobody, _ONES)
         self._learned += 1
         add_to_mean(planes, gain, self._learned, self._mean, self._variance)
 
@@ -363,9 +365,9 @@ class BackgroundModel:
                 self._variance[c] = cv2.blur(self._variance[c] / np.float32(self._learned - 1), (5, 5))
         self._fix_model()
 
-    def _estimate_noise(self, planes: Bytes) -> None:
+    def _estimate_noise(self, image: Bytes) -> None:
         """Take each pixel's noise from one image: the background has none yet."""
-        self._variance = np.maximum(self._variance, noise_variance(planes, self._mean, self._gain))
+        self._variance = np.maximum(self._variance, noise_variance(planes_of(image), self._mean, self._gain))
         self._noise_known = True
         self._fix_model()
 
@@ -379,72 +381,69 @@ class BackgroundModel:
         # Three copies of one channel must not count as three measurements.
         return np.float32(1 / 3 if self._grey else 1), np.float32(self._config.sigma_floor**2)
 
-    def _measure(self, planes: Bytes) -> tuple[Bytes, Bytes]:
-        """Change and colour [h, w] of an image."""
-        if self._evidence.shape[1:] != planes.shape[1:]:
-            self._evidence = np.empty((2, *planes.shape[1:]), dtype=np.uint8)
-        model = self._level, self._sharpness, self._gain
-        most = min(max(PARTLY, 1.5 * self._share), FITS)
-        measure_evidence(planes, *model, self._config, self._grey, self._turn, most, *self._evidence)
-        return self._evidence[0], self._evidence[1]
+    def _background(self) -> Background:
+        darkest, brightest = self._config.shadow_darkest, self._config.highlight_brightest
+        if self._grey:  # three equal channels: no colour tells a shadow
+            darkest = brightest = 1.0
+        return Background(self._level, self._sharpness, self._gain, np.float32(darkest), np.float32(brightest))
 
-    def _follow(self, planes: Bytes, change: Bytes) -> None:
+    def _look(self, image: Bytes) -> Look:
+        return look_at(image, self._background(), self._config, self._turn)
+
+    def _measure(self, image: Bytes, looked: Look) -> Evidence:
+        """Change and colour of an image, everywhere when much of it is not the background's."""
+        everywhere = looked.share > min(max(PARTLY, 1.5 * self._share), FITS)
+        return measure_evidence(image, looked, self._background(), self._config, everywhere)
+
+    def _follow(self, image: Bytes, looked: Look) -> None:
         """Let the background pixels of this image's share of rows learn."""
         weight, floor = self._weight_and_floor()
-        learn(
-            planes,
-            self._mean,
-            self._variance,
-            self._level,
-            self._sharpness,
-            self._gain,
-            self._busy,
-            change,
-            np.float32(change_level(self._config)),
-            np.float32(1.0 - (1.0 - self._config.learning_rate) ** LEARNED_ROWS),
-            floor,
-            weight,
-            self._turn,
-            LEARNED_ROWS,
-        )
+        rate = np.float32(1.0 - (1.0 - self._config.learning_rate) ** LEARNED_ROWS)
+        model = self._mean, self._variance, self._level, self._sharpness, self._gain
+        turn = looked.first, LOOKED_ROWS, self._turn // LOOKED_ROWS, LEARNED_ROWS // LOOKED_ROWS
+        learn(image, *model, self._busy, looked.changed, rate, floor, weight, *turn)
         self._turn = (self._turn + 1) % LEARNED_ROWS
 
-    def _far(self, change: Bytes) -> tuple[Bytes, float]:
-        """Where the image is not the background [h, w], and the share of it."""
-        far = np.asarray(cv2.compare(change, change_level(self._config), cv2.CMP_GE), dtype=np.uint8)
-        return far, cv2.countNonZero(far) / far.size
+    def _changed(self, evidence: Evidence | None) -> Bytes:
+        """Where an image was not the background [h, w]."""
+        shape = self._mean.shape[1:]
+        return np.zeros(shape, np.uint8) if evidence is None else evidence.changed(shape, change_level(self._config))
 
-    def _partly_jumped(self, planes: Bytes, far: Bytes, share: float) -> bool:
+    def _somebody(self) -> Bytes:
+        """Where something else than background was a moment ago [h, w]."""
+        return self._changed(self._before) | np.asarray(spread(self._busy, self._mean.shape[2]), dtype=np.uint8)
+
+    def _partly_jumped(self, image: Bytes, looked: Look) -> bool:
         """Whether suddenly much more differs because of the light, which is followed then; or somebody came close."""
-        if self._frozen or share <= PARTLY or share <= 2 * self._share:
+        if self._frozen or looked.share <= PARTLY or looked.share <= 2 * self._share:
             self._doubts = 0
             return False
         self._doubts = (self._doubts + 1) % PATIENCE
         if self._doubts:
             return False
-        if self._recall(planes, min(FITS, share / 2)):
+        if self._recall(image, min(FITS, looked.share / 2)):
             return True
-        found = relight(planes, self._mean, self._changed | self._busy, cautious=True)
-        new = (far > 0) & (self._changed == 0)
+        found = relight(planes_of(image), self._mean, self._somebody(), cautious=True)
+        new = (self._changed(self._measure(image, looked)) > 0) & (self._changed(self._before) == 0)
         is_light = bool(np.count_nonzero(new & found.follows) > SURELY_LIGHT * np.count_nonzero(new))
         return is_light and found.agreement > SURELY_SAME and self._adopt(found.mean)
 
-    def _light_jumped(self, planes: Bytes) -> bool | None:
+    def _light_jumped(self, image: Bytes) -> bool | None:
         """Most of the image differs. None when there is a background for it now; else whether the camera has moved."""
         self._upset += 1
         if self._frozen:
             return False
-        if self._recall(planes, FITS):
+        if self._recall(image, FITS):
             return None
         if self._upset < PATIENCE or (self._upset - PATIENCE) % MOVED_PATIENCE:
             return self._upset > PATIENCE
-        found = relight(planes, self._mean, self._changed | self._busy, cautious=self._fresh)
+        found = relight(planes_of(image), self._mean, self._somebody(), cautious=self._fresh)
         if found.other_view:
             return True
         if not found.same_view:
             self._keep(self._mean, self._variance)
             self._forget()
-            self._learn(planes)
+            self._learn(image)
             return False
         self._adopt(found.mean)
         return None
@@ -463,20 +462,20 @@ class BackgroundModel:
         """Put a background by: its light may come back."""
         self._former.append((mean.copy(), np.minimum(variance, 6e4).astype(np.float16)))
 
-    def _recall(self, planes: Bytes, most: float) -> bool:
+    def _recall(self, image: Bytes, most: float) -> bool:
         """Take a background of before again when at most this share of the image differs from it."""
         kept = self._mean, self._variance, self._gain
         for n, former in reversed(list(enumerate(self._former))):
             self._mean, self._variance = former[0], former[1].astype(np.float32)
             self._fix_model()
-            nobody = np.zeros(self._mean.shape[1:], dtype=np.uint8)
-            self._gain = light_gain(planes, self._level, nobody, _ONES, self._stride())
-            if self._far(self._measure(planes)[0])[1] > most:
+            nobody = no_pixels(*self._mean.shape[1:])
+            self._gain = light_of(image, self._level, nobody, _ONES)
+            if self._look(image).share > most:
                 continue
             del self._former[n]
             if self._ready:
                 self._keep(*kept[:2])
-            self._busy = self._changed = nobody
+            self._busy, self._before = nobody, None
             self._learned, self._ready, self._noise_known = max(self._learned, 1), True, True
             self._upset, self._relit = 0, self._relit + 1
             return True

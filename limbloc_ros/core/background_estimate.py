@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from limbloc_ros.core._background_kernels import LEVEL_SCALE, densest_mean, light_gain
+from limbloc_ros.core._bit_kernels import no_pixels
 from limbloc_ros.core.errors import InputError
 
 Bytes = NDArray[np.uint8]
@@ -90,9 +91,9 @@ def estimate_background(frames: Iterable[Bytes], share: float = 0.4) -> Backgrou
     samples = np.stack(stack)
     spread = samples[np.linspace(0, len(samples) - 1, min(len(samples), 9)).round().astype(int)]
     middle = np.ascontiguousarray(fixed_levels(np.median(spread, axis=0)).transpose(2, 0, 1))
-    nobody = np.zeros(middle.shape[1:], dtype=np.uint8)
+    nobody = no_pixels(*middle.shape[1:])
     ones = np.ones(3, dtype=np.float32)
-    gains = np.stack([light_gain(np.ascontiguousarray(f.transpose(2, 0, 1)), middle, nobody, ones, 4) for f in samples])
+    gains = np.stack([light_gain(f, middle, nobody, ones, 4) for f in samples])
     mean, sigma = densest_mean(samples, gains, share)
     return BackgroundEstimate(mean, sigma)
 

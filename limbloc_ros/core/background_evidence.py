@@ -1,16 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
 """Image and background -> evidence: how far every pixel is from its background, measured where it matters.
 
-Most of an image is background. Every fourth row is measured in full; of the others only what lies around foreground in
-these, unless much has changed. What is missed is too small to be kept in a mask.
+Most of an image is background. Every fourth row is looked at; what lies around foreground in these is measured, or
+everything when much has changed. What is missed is too small to be kept in a mask.
 """
 
 from __future__ import annotations
 
+import math
+from typing import NamedTuple
+
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from limbloc_ros.core._background_kernels import CHANGE_SCALE, COLOUR_SCALE, foreground_spans, measure
+from limbloc_ros.core._background_kernels import (
+    CHANGE_SCALE,
+    COLOUR_SCALE,
+    box_of,
+    foreground_spans,
+    light_gain,
+    look,
+    measure,
+)
+from limbloc_ros.core._bit_kernels import Bits, no_pixels
 from limbloc_ros.core.config import BackgroundConfig
 
 Bytes = NDArray[np.uint8]
@@ -18,9 +31,9 @@ Words = NDArray[np.uint16]
 Floats = NDArray[np.float32]
 
 LOOKED_ROWS = 4
-"""Every so many rows are measured in full."""
+"""Every so many rows are looked at."""
 
-RIM_PX = 24
+RIM_PX = 12
 """So much around foreground in these is measured as well, px at 640x480."""
 
 REFERENCE_PIXELS = 640 * 480
@@ -37,45 +50,127 @@ def colour_level(config: BackgroundConfig) -> int:
     return min(round(config.shadow_sigmas * COLOUR_SCALE), 255)
 
 
+class Background(NamedTuple):
+    """What an image is held against, as the kernels take it.
+
+    Attributes:
+        level, sharpness: [3, H, W] mean and one over sigma in fixed point, as `_background_kernels.measure` takes
+            them.
+        gain: [3] brightness of the light now over that of the background.
+        darkest, brightest: shadows and highlights scale the background by a factor in this range.
+    """
+
+    level: Words
+    sharpness: Words
+    gain: Floats
+    darkest: np.float32
+    brightest: np.float32
+
+
+class Look(NamedTuple):
+    """The rows of an image that tell where something is.
+
+    Attributes:
+        first: rows first, first + LOOKED_ROWS, ... are these.
+        changed: [R, N] bits (`_bit_kernels`), set where a pixel is not the background's.
+        share: part of their pixels that are not, 0 to 1.
+    """
+
+    first: int
+    changed: Bits
+    share: float
+
+
+class Evidence(NamedTuple):
+    """How far the pixels are from their background where somebody may be; elsewhere everything is background.
+
+    Attributes:
+        top, left: where in the image the arrays begin; `left` is a multiple of 64.
+        change: [h, w] distance to the background in sigmas * CHANGE_SCALE; 0 where nothing was measured.
+        colour: [h, w] likewise the part of it that no shadow explains, in sigmas * COLOUR_SCALE.
+    """
+
+    top: int
+    left: int
+    change: Bytes
+    colour: Bytes
+
+    @property
+    def box(self) -> tuple[slice, slice]:
+        """Where in the image the arrays lie."""
+        height, width = self.change.shape
+        return slice(self.top, self.top + height), slice(self.left, self.left + width)
+
+    def changed(self, shape: tuple[int, int], level: int) -> Bytes:
+        """uint8 [H, W] of the whole image, 255 where the change has this level."""
+        out = np.zeros(shape, dtype=np.uint8)
+        out[self.box] = cv2.compare(self.change, level, cv2.CMP_GE) if self.change.size else 0
+        return out
+
+
+def at_working_size(image: Bytes, most_pixels: int) -> Bytes:
+    """An image [H, W, 3], halved until it has no more pixels than this, as the kernels take it."""
+    height, width = image.shape[:2]
+    factor = 1
+    while (height // factor) * (width // factor) > most_pixels:
+        factor *= 2
+    if factor > 1:
+        image = cv2.resize(image, (width // factor, height // factor), interpolation=cv2.INTER_AREA)
+    image = np.ascontiguousarray(image).view()
+    image.flags.writeable = False  # as a message's pixels are: the kernels are compiled for one of both only
+    return image
+
+
+def planes_of(image: Bytes) -> Bytes:
+    """An image [H, W, 3] as [3, H, W]."""
+    return np.stack(cv2.split(image))
+
+
+def scale_of(pixels: int) -> float:
+    """Px of an image of so many pixels per px at 640x480."""
+    return math.sqrt(pixels / REFERENCE_PIXELS)
+
+
+def light_of(image: Bytes, level: Words, busy: Bits, last: Floats) -> Floats:
+    """The gain of the light of an image [H, W, 3] from some 1500 pixels; arguments as `light_gain` takes them."""
+    height, width = image.shape[:2]
+    return np.asarray(light_gain(image, level, busy, last, max(1, int(math.sqrt(height * width / 1500)))))
+
+
+def look_at(image: Bytes, background: Background, config: BackgroundConfig, turn: int) -> Look:
+    """Look at some rows of an image [H, W, 3]: turn % LOOKED_ROWS, + LOOKED_ROWS, ..."""
+    first = turn % LOOKED_ROWS
+    height, width = image.shape[:2]
+    changed = no_pixels((height - first + LOOKED_ROWS - 1) // LOOKED_ROWS, width)
+    far = np.float32(change_level(config) / CHANGE_SCALE)
+    number = look(image, background.level, background.sharpness, background.gain, first, LOOKED_ROWS, far, changed)
+    return Look(first, changed, number / (len(changed) * width))
+
+
 def measure_evidence(
-    planes: Bytes,
-    level: Words,
-    sharpness: Words,
-    gain: Floats,
-    config: BackgroundConfig,
-    grey: bool,
-    turn: int,
-    most: float,
-    change: Bytes,
-    colour: Bytes,
-) -> None:
+    image: Bytes, looked: Look, background: Background, config: BackgroundConfig, everywhere: bool
+) -> Evidence:
     """Measure an image's distance to its background.
 
     Args:
-        planes: [3, H, W] the image.
-        level, sharpness: [3, H, W] the background in fixed point, as `_background_kernels.measure` takes it.
-        gain: [3] brightness of the light now over that of the background.
+        image: [H, W, 3].
+        looked: what `look_at` found.
+        background: the background.
         config: thresholds.
-        grey: three equal channels: no colour tells a shadow.
-        turn: rows turn % LOOKED_ROWS, + LOOKED_ROWS, ... are those measured in full.
-        most: when more than this share of them changed, everything is measured.
-        change: [H, W] out, distance to the background in sigmas * CHANGE_SCALE; 0 where nothing was measured.
-        colour: [H, W] out, likewise the part of it that no shadow explains, in sigmas * COLOUR_SCALE.
+        everywhere: measure all of it, not only around what was found.
     """
-    height, width = change.shape
-    shadows = (1.0, 1.0) if grey else (config.shadow_darkest, config.highlight_brightest)
-    background = level, sharpness, gain, np.float32(shadows[0]), np.float32(shadows[1])
-    change.fill(0)
-    colour.fill(0)
-    first = turn % LOOKED_ROWS
-    spans = np.zeros((height, 2), dtype=np.int32)
-    spans[first::LOOKED_ROWS, 1] = width
-    measure(planes, *background, spans, change, colour)
-    levels = change_level(config), colour_level(config)
-    if np.count_nonzero(change[first::LOOKED_ROWS] >= levels[0]) > most * change.size / LOOKED_ROWS:
+    height, width = image.shape[:2]
+    scale = scale_of(height * width)
+    spans = np.empty((height, 2), dtype=np.int32)
+    if everywhere:
         spans[:] = 0, width
     else:
-        rim = max(LOOKED_ROWS, round(RIM_PX * np.sqrt(change.size / REFERENCE_PIXELS)))
-        foreground_spans(change, levels[0], colour, levels[1], first, LOOKED_ROWS, rim, spans)
-    spans[first::LOOKED_ROWS] = 0  # these are measured already
-    measure(planes, *background, spans, change, colour)
+        rim = max(LOOKED_ROWS, round(RIM_PX * scale))
+        least = colour_level(config)
+        foreground_spans(image, *background, looked.changed, least, looked.first, LOOKED_ROWS, rim, spans)
+    # A closed crack needs some room around it.
+    pad = 3 + round(config.close_px * scale)
+    top, bottom, left, right = box_of(spans, pad, width)
+    change, colour = np.zeros((2, bottom - top, right - left), dtype=np.uint8)
+    measure(image, *background, top, left, spans[top:bottom], change, colour)
+    return Evidence(top, left, change, colour)

@@ -85,15 +85,15 @@ def relight(planes: Bytes, mean: Floats, changed: Bytes, cautious: bool = False)
     return Relit(np.where(free, planes.astype(np.float32), relit).astype(np.float32), agreement, good, smooth)
 
 
-def shows_nothing(planes: Bytes, mean: Floats | None) -> bool:
-    """Whether an image [3, H, W] is black, white or of one grey: a covered lens, a dead sensor.
+def shows_nothing(image: Bytes, mean: Floats | None) -> bool:
+    """Whether an image [H, W, 3] is black, white or of one grey: a covered lens, a dead sensor.
 
     Args:
-        planes: uint8 [3, H, W].
+        image: uint8 [H, W, 3].
         mean: float32 [3, H, W] the background, which may be as plain; None while there is none.
     """
-    image = planes[:, ::_SAMPLING, ::_SAMPLING]
-    spread = float(image.std(axis=(1, 2)).max())
+    image = image[::_SAMPLING, ::_SAMPLING]
+    spread = float(image.std(axis=(0, 1)).max())
     if spread >= FLAT_LEVELS:
         return False
     if mean is None:
