@@ -47,7 +47,7 @@ class CarvingReport:
         self._node = node
         self._topics = dict(topics)
         self._masks = {camera: Meter() for camera in topics}
-        self._fill = dict.fromkeys(topics, float("nan"))
+        self._seen: dict[str, Pixels] = {}
         self._sets = Meter()
         self._last: FrameSet[Pixels] | None = None
         self._outcome: Hull | NoPerson | None = None
@@ -66,7 +66,7 @@ class CarvingReport:
         """A usable mask came."""
         self._masks[camera].tick(latency_s)
         self._skew.mask(camera, stamp_ns)
-        self._fill[camera] = 100.0 * cv2.countNonZero(mask) / mask.size
+        self._seen[camera] = mask
 
     def carved(self, frames: FrameSet[Pixels], outcome: Hull | NoPerson, carve_ms: float, latency_s: float) -> None:
         """A set was carved and its hull published."""
@@ -186,6 +186,7 @@ class CarvingReport:
     ) -> DiagnosticStatus:
         meter, level, message = self._masks[camera], OK, "used"
         rejected = self._outcome.rejected if isinstance(self._outcome, Hull) else {}
+        seen = self._seen.get(camera)
         if camera in problems:
             level, message = ERROR, f"not in the rig: {problems[camera]}"
         elif meter.silence_s > SILENT_S:
@@ -199,7 +200,7 @@ class CarvingReport:
         values = {
             "rate_hz": meter.rate_hz,
             "latency_ms": meter.latency_ms,
-            "mask_fill_percent": self._fill[camera],
+            "mask_fill_percent": 100.0 * cv2.countNonZero(seen) / seen.size if seen is not None else float("nan"),
             "stamp_behind_ms": self._skew.behind_ms().get(camera, float("nan")),
             "received": counters.received.get(camera, 0),
             "missing": counters.missing.get(camera, 0),
