@@ -127,6 +127,7 @@ class TestKernels:
         assert added(colour, 1.0) == hole
         assert added(colour, 0.7, (0, 10, 0, 11)) == hole  # it reaches the rim of the box
         assert kernels.box_around(packed(mask), 12, 1) == (1, 10, 1, 10)
+        assert kernels.box_around(packed(mask), 12, 5) == (0, 11, 0, 11)
         assert added(np.zeros_like(mask), 0.7) == []  # the background's very colour: a shadow
 
     @pytest.mark.parametrize(("top", "left", "width"), [(3, 64, 64), (0, 0, 128), (3, 64, 76), (0, 0, 140)])
@@ -221,7 +222,7 @@ class TestCleaning:
 def test_the_warm_up_leaves_no_kernel_to_be_compiled_for_the_first_person(monkeypatch):
     """As it was when nothing in its images was foreground: the first person was not seen for ten seconds."""
     used = set()
-    wanted = {"measure", "silhouette", "place", "learn", "light_gain", "look", "foreground_spans"}
+    wanted = {"measure", "foreground", "silhouette", "place", "learn", "light_gain", "look", "foreground_spans"}
     for module in (background, background_evidence, kernels):
         for name in wanted & set(vars(module)):
             kernel = getattr(module, name)

@@ -105,7 +105,10 @@ def _at_rim(y: int, start: int, end: int, height: int, width: int) -> bool:
 
 @njit(cache=True)
 def box_around(mask: Bits, width: int, pad: int) -> tuple[int, int, int, int]:
-    """First and last row, first and last column of `pad` pixels around a mask, within the array."""
+    """First and last row, first and last column of `pad` pixels around a mask, within the array.
+
+    Of an empty mask the last row is above the first.
+    """
     height, number = mask.shape
     top, bottom, left, right = height, -1, width, -1
     for y in range(height):
@@ -114,6 +117,8 @@ def box_around(mask: Bits, width: int, pad: int) -> tuple[int, int, int, int]:
                 top, bottom = min(top, y), y
                 left = min(left, WORD * k + lowest(mask[y, k]))
                 right = max(right, WORD * k + highest(mask[y, k]))
+    if bottom < 0:
+        return height, -1, width, -1
     return max(top - pad, 0), min(bottom + pad, height - 1), max(left - pad, 0), min(right + pad, width - 1)
 
 
@@ -245,32 +250,49 @@ def trim(mask: Bits, core: Bits, change: Bytes, fraction: int) -> None:
 
 
 @njit(cache=True)
+def foreground(
+    change: Bytes, colour: Bytes, changed_level: int, weak_level: int, strong_level: int
+) -> tuple[Bits, Bits]:
+    """What is changed, and what of it is foreground by its colour, with hysteresis; single noisy pixels are neither.
+
+    Args:
+        change, colour: [H, W] evidence.
+        changed_level: level of `change` from which on a pixel is changed.
+        weak_level, strong_level: levels of `colour`.
+
+    Returns:
+        two masks [H, N], bits.
+    """
+    width = change.shape[1]
+    changed = mostly(at_least(change, changed_level), width)
+    mask = changed & mostly(at_least(colour, weak_level), width)
+    strong = mask & mostly(at_least(colour, strong_level), width)
+    keep_strong_parts(mask, strong, width)
+    return changed, mask
+
+
+@njit(cache=True)
 def silhouette(
+    mask: Bits,
+    changed: Bits,
     change: Bytes,
     colour: Bytes,
-    calm: Bytes,
-    changed_level: int,
-    weak_level: int,
-    strong_level: int,
     opening: Widths,
     closing: Widths,
     cloth: float,
     border_ratio: float,
-    pad: int,
+    box: tuple[int, int, int, int],
     hole: float,
     fraction: int,
     least: float,
 ) -> Bits:
-    """All steps from evidence to a mask, in one call.
+    """From foreground to a silhouette, in one call.
 
     Args:
+        mask, changed: [H, N] bits, as `foreground` gives them.
         change, colour: [H, W] evidence.
-        calm: [H, W] the median of the colour around each pixel.
-        changed_level: level of `change` from which on a pixel is changed.
-        weak_level, strong_level: levels of `colour` for hysteresis.
         opening, closing: windows, as for `dilate`.
-        cloth, border_ratio: least mean colour and ratio of borders of body that passes for shadow.
-        pad: such body reaches out of the box of the foreground by less than this, px.
+        cloth, border_ratio, box: for `add_body_parts`.
         hole, least: smaller holes are filled, smaller blobs erased, px.
         fraction: as for `trim`; 0 for no trimming.
 
@@ -278,20 +300,13 @@ def silhouette(
         [H, N] bits.
     """
     width = change.shape[1]
-    changed = mostly(at_least(change, changed_level), width)
-    mask = changed & mostly(at_least(colour, weak_level), width)
-    strong = mask & mostly(at_least(colour, strong_level), width)
-    if not strong.any():
-        return strong  # type: ignore[no-any-return]
-    keep_strong_parts(mask, strong, width)
-    box = box_around(mask, width, pad)
     if len(opening) > 1:
         mask = dilate(erode(mask, width, opening), width, opening)
     mask = erode(dilate(mask, width, closing), width, closing)
     # Skin or cloth in nearly the background's colour leaves bites in the outline and holes. A cast shadow touches the
     # body only at the feet; the shadow seen between two legs is enclosed by them but has the floor's very colour.
-    add_body_parts(mask, changed, calm, cloth, border_ratio, box)
-    fill_holes(mask, changed, calm, cloth, hole)
+    add_body_parts(mask, changed, colour, cloth, border_ratio, box)
+    fill_holes(mask, changed, colour, cloth, hole)
     if fraction > 0:
         # Blur spreads a person by a pixel or two; the true outline is where the change has half its inner value. A
         # wider window would also drop the halo that video codecs draw, but with it faint limbs beside something of
@@ -299,9 +314,9 @@ def silhouette(
         trim(mask, erode(mask, width, np.full(5, 2, dtype=np.int32)), change, fraction)
         cross = np.array([0, 1, 0], dtype=np.int32)
         mask = erode(dilate(mask, width, cross), width, cross)
-        fill_holes(mask, changed, calm, cloth, hole)
+        fill_holes(mask, changed, colour, cloth, hole)
     erase_blobs(mask, width, least)
-    return mask  # type: ignore[no-any-return]
+    return mask
 
 
 @njit(cache=True)
