@@ -11,7 +11,7 @@ import pytest
 from flesh_hulls import moved
 
 from limbloc_ros.core import tracker
-from limbloc_ros.core.engine_robust import Fit
+from limbloc_ros.core.engine_robust import SETTLED_M, Fit
 from limbloc_ros.core.figure import BONE, FigureState, place
 from limbloc_ros.core.hull import Hull
 from limbloc_ros.core.limb_pairs import with_limb
@@ -189,7 +189,7 @@ class Stand:
         return SimpleNamespace(cost=self.costs.get(self.frame, 1e-4))
 
     def check(self, limbs, result, hull, surface, evidence, size, settled_m):
-        assert settled_m == (0.0 if len(limbs) == 4 else Tracker.SETTLED_M)
+        assert settled_m == (0.0 if len(limbs) == 4 else SETTLED_M)
         self.checked.append((self.frame, [f"{kind.bones[0]}_{side}" for kind, side in limbs]))
         return SimpleNamespace(**vars(result)) if self.frame in self.found else result
 

@@ -102,6 +102,8 @@ HARDER = Effort(
 SEARCHES = (QUICK, Effort(), HARDER)
 #: Torsos of one hull that differ and are worth a try.
 MOST_TORSOS = 14
+#: A limb that all its joints have so near to where it is is not tried there; nor is one that settles so near.
+SAME_PLACE_M, SETTLED_M = 0.05, 0.03
 #: Figures of up to so many times the least energy are rivals.
 RIVAL_COST = 1.5
 
@@ -410,11 +412,20 @@ def _with_better_limb(
     """The winner, or it with one limb elsewhere if that fits better: trunk and sizes are known by now."""
     _, _, repair, limited, final = effort.iterations
     for state in with_one_limb(winner.state, scene, kind, side, places, effort.candidates):
+        if apart_m(state, winner.state) < SAME_PLACE_M:
+            continue
         settled = refine(state, scene.quick, scene.lenient, repair).state
+        if apart_m(settled, winner.state) < SETTLED_M:
+            continue
         other = refine(settled, scene.full, scene.weights, limited)
         if other.system.cost + unseen(other.state, scene.hull) < winner.system.cost + unseen(winner.state, scene.hull):
             winner = refine(other.state, scene.full, scene.weights, final)
     return winner
+
+
+def apart_m(a: FigureState, b: FigureState) -> float:
+    """The largest distance between the same joints of two figures, m."""
+    return float(np.linalg.norm(figure.place(a).joints - figure.place(b).joints, axis=1).max())
 
 
 def _with_limbs(states: list[FigureState], scene: Scene, effort: Effort) -> list[FigureState]:

@@ -13,9 +13,12 @@ from limbloc_ros.core import energy, lm
 from limbloc_ros.core.energy import Evidence, Weights
 from limbloc_ros.core.engine_robust import (
     QUICK,
+    SAME_PLACE_M,
+    SETTLED_M,
     Effort,
     Fit,
     KnownSize,
+    apart_m,
     firm,
     fit_from_scratch,
     gather_evidence,
@@ -24,7 +27,7 @@ from limbloc_ros.core.engine_robust import (
     unseen,
     with_one_limb,
 )
-from limbloc_ros.core.figure import BONE, FigureState, place
+from limbloc_ros.core.figure import BONE, FigureState
 from limbloc_ros.core.hull import Hull
 from limbloc_ros.core.search import ARM, LEG, LimbKind, Medial
 from limbloc_ros.core.surface import Surface
@@ -62,10 +65,8 @@ class Tracker:
     TURN, PLACES, LIMB_GAIN = 3, 1, 0.03
     #: When the cost is so much above the usual one, the figure is first carried on by so many steps, and then all limbs
     #: are checked at once; each time in vain, the wait doubles, up to this, unless the cost rises as much once more.
+    #: Then a limb that settles where it was counts as well: it may have come back along a better way.
     LIMB_DOUBT, MORE_STEPS, LONGEST_DOUBT = 1.25, 10, 8
-    #: A limb that all its joints have so near to where it is stays there; so does one that settles so near, unless the
-    #: cost is high: then it may have come back along a better way.
-    SAME_PLACE_M, SETTLED_M = 0.05, 0.03
     #: The figure is carried along with the firm weights of the search, which lead from further off; so many more steps
     #: with the final ones put its joints in their places.
     FINAL_STEPS = 4
@@ -178,7 +179,7 @@ class Tracker:
             self._turn = (self._turn + 1) % len(LIMBS)
         else:
             return result
-        checked = self._check_limbs(limbs, result, hull, surface, evidence, size, 0.0 if hasty else self.SETTLED_M)
+        checked = self._check_limbs(limbs, result, hull, surface, evidence, size, 0.0 if hasty else SETTLED_M)
         self._next_check = self._frame + self.TURN
         if checked is not result:
             self._doubt_wait, self._next_doubt = 1, self._frame + 1
@@ -201,10 +202,10 @@ class Tracker:
         scene = make_scene(hull, Medial.of(hull), surface, self._seed, self._weights, QUICK)
         for kind, side in limbs:
             for state in with_one_limb(result.state, scene, kind, side, self.PLACES, QUICK.candidates):
-                if _apart_m(state, result.state) < self.SAME_PLACE_M:
+                if apart_m(state, result.state) < SAME_PLACE_M:
                     continue
                 settled = refine(state, scene.quick, scene.lenient, 5, size).state
-                if _apart_m(settled, result.state) < settled_m:
+                if apart_m(settled, result.state) < settled_m:
                     continue
                 other = refine(settled, evidence, self._firm, 8, size)
                 gain = result.system.cost - other.system.cost
@@ -212,7 +213,3 @@ class Tracker:
                 if gain > self.LIMB_GAIN * result.system.cost:
                     result = other
         return result
-
-
-def _apart_m(a: FigureState, b: FigureState) -> float:
-    return float(np.linalg.norm(place(a).joints - place(b).joints, axis=1).max())
