@@ -13,6 +13,7 @@ from limbloc_ros.core import hull as hulls
 from limbloc_ros.core.config import HullConfig
 from limbloc_ros.core.errors import InputError
 from limbloc_ros.core.hull import NOBODY, Hull, carve, largest_component
+from limbloc_ros.core.pipeline import Carver
 from limbloc_ros.core.silhouettes import lattice_bounds
 
 
@@ -93,6 +94,14 @@ def hull_of(solid, voxel_m=0.05, band_m=0.1, at=(3, -4, 0)):
     sdf = np.where(inside, -0.01, np.minimum(away, band_m)).astype(np.float32)
     indices = np.argwhere(sdf < np.float32(band_m)) + np.array(at)
     return Hull.from_shell(voxel_m, band_m, indices.astype(np.int32), sdf[sdf < np.float32(band_m)])
+
+
+def test_the_warm_up_takes_a_hull_apart(monkeypatch):
+    """Else the first frame with a speck beside the person would wait for the compiler."""
+    kept, with_parts = [], hulls._with_parts
+    monkeypatch.setattr(hulls, "_with_parts", lambda *args: kept.append(args[2]) or with_parts(*args))
+    Carver.warm_up.__wrapped__()
+    assert len(kept) == 1
 
 
 def test_largest_component_drops_the_rest_and_its_shell():

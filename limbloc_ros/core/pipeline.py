@@ -146,6 +146,7 @@ def _warm_up_room() -> tuple[Rig, HullConfig]:
 def _warm_up_masks() -> dict[str, NDArray[np.uint8]]:
     mask = np.zeros((160, 160), np.uint8)
     mask[50:66, 73:87] = mask[66:110, 66:94] = mask[110:150, 68:78] = mask[110:150, 82:92] = 255
+    mask[41:46, 76:84] = 255  # a hat in the air, so that taking a hull's parts apart is compiled
     one_legged = mask.copy()  # so that mending is compiled as well, of what one mask misses and of what two miss
     one_legged[110:150, 82:92] = 0
     armless = mask.copy()
