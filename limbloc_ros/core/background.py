@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from limbloc_ros.core._background_kernels import add_to_mean, fix_all, learn
 from limbloc_ros.core._bit_kernels import no_pixels, spread
 from limbloc_ros.core._mask_kernels import place
-from limbloc_ros.core.background_estimate import BackgroundEstimate, estimate_background, fixed_levels, noise_variance
+from limbloc_ros.core.background_estimate import BackgroundEstimate, estimate_background, light_over, noise_variance
 from limbloc_ros.core.background_evidence import (
     LOOKED_ROWS,
     Background,
@@ -349,8 +349,7 @@ class BackgroundModel:
         if self._learned == 0:
             self._allocate(planes)
             return
-        nobody = no_pixels(*image.shape[:2])
-        gain = light_of(image, fixed_levels(self._mean), nobody, _ONES)
+        gain = light_over(image, self._mean)
         self._learned += 1
         add_to_mean(planes, gain, self._learned, self._mean, self._variance)
 

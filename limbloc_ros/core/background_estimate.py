@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from limbloc_ros.core._background_kernels import LEVEL_SCALE, densest_mean, light_gain
 from limbloc_ros.core._bit_kernels import no_pixels
+from limbloc_ros.core.background_evidence import light_stride
 from limbloc_ros.core.errors import InputError
 
 Bytes = NDArray[np.uint8]
@@ -101,3 +102,12 @@ def estimate_background(frames: Iterable[Bytes], share: float = 0.4) -> Backgrou
 def fixed_levels(grey_levels: NDArray[np.floating[Any]]) -> NDArray[np.uint16]:
     """Means in the kernels' fixed point."""
     return np.asarray(np.rint(grey_levels * LEVEL_SCALE), dtype=np.uint16)
+
+
+def light_over(image: Bytes, mean: Floats) -> Floats:
+    """The gain [3] of the light of an image [H, W, 3] of the empty room over that of a mean [3, H, W], grey levels."""
+    stride = light_stride(mean[0].size)
+    some = slice(stride // 2, None, stride)  # only these need be brought to fixed point
+    pixels = np.ascontiguousarray(image[some, some])
+    ones = np.ones(3, dtype=np.float32)
+    return np.asarray(light_gain(pixels, fixed_levels(mean[:, some, some]), no_pixels(*pixels.shape[:2]), ones, 1))

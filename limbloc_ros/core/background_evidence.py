@@ -131,10 +131,14 @@ def scale_of(pixels: int) -> float:
     return math.sqrt(pixels / REFERENCE_PIXELS)
 
 
+def light_stride(pixels: int) -> int:
+    """Every so many rows and columns are enough to tell the light of an image: some 1500 pixels."""
+    return max(1, int(math.sqrt(pixels / 1500)))
+
+
 def light_of(image: Bytes, level: Words, busy: Bits, last: Floats) -> Floats:
-    """The gain of the light of an image [H, W, 3] from some 1500 pixels; arguments as `light_gain` takes them."""
-    height, width = image.shape[:2]
-    return np.asarray(light_gain(image, level, busy, last, max(1, int(math.sqrt(height * width / 1500)))))
+    """The gain of the light of an image [H, W, 3]; arguments as `light_gain` takes them."""
+    return np.asarray(light_gain(image, level, busy, last, light_stride(image.shape[0] * image.shape[1])))
 
 
 def look_at(image: Bytes, background: Background, config: BackgroundConfig, turn: int) -> Look:
