@@ -352,8 +352,8 @@ def posture_term(
 def xor_counts(sdf: Any, origin: Any, voxel: float, parts: Any, spheres: Any, radii: Any) -> tuple[int, int, int]:
     """Voxels inside the hull only, inside the flesh only (anywhere in the world), and inside the hull (eq. 2).
 
-    A distance changes by no more than the way travelled, and a part is convex: so in a column of voxels few distances
-    tell where it goes in and out.
+    A distance changes by no more than the way travelled, a part is convex, and holds all of its spheres: so in a column
+    of voxels few distances tell where it goes in and out.
     """
     rows, bounds = lay_out(parts, spheres, radii)
     low = np.zeros(3, np.int64)
@@ -369,6 +369,7 @@ def xor_counts(sdf: Any, origin: Any, voxel: float, parts: Any, spheres: Any, ra
     flesh = 0
     both = 0
     for p in range(len(parts)):
+        row = rows[p]
         for a in range(3):
             s0 = 1e9
             s1 = -1e9
@@ -396,10 +397,18 @@ def xor_counts(sdf: Any, origin: Any, voxel: float, parts: Any, spheres: Any, ra
                     if column[k - low[2]]:
                         k += 1
                         continue
-                    d, _, _ = distance_to_part(rows[p], x, y, origin[2] + k * voxel, no_ray)
+                    z = origin[2] + k * voxel
+                    d, wb, wc = distance_to_part(row, x, y, z, no_ray)
                     steps = 1 + int(max(abs(d) - SLACK, 0.0) / voxel)
                     if d < 0.0:
                         entered = True
+                        # the part holds the whole sphere of these weights, which the column leaves further up
+                        cx = x - row[1] - wb * row[4] - wc * row[7]
+                        cy = y - row[2] - wb * row[5] - wc * row[8]
+                        cz = row[3] + wb * row[6] + wc * row[9] - z
+                        r = row[10] + wb * row[11] + wc * row[12]
+                        out = cz + math.sqrt(max(r * r - cx * cx - cy * cy, 0.0))
+                        steps = max(steps, 1 + int(max(out - SLACK, 0.0) / voxel))
                         for m in range(k, min(k + steps, end + 1)):
                             if not column[m - low[2]]:
                                 column[m - low[2]] = True
