@@ -17,6 +17,9 @@ OFFSETS: Ints = np.array(
     [(i, j, k) for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1) if (i, j, k) != (0, 0, 0)], dtype=np.int32
 )
 
+#: A value of the field that is nobody's difference, m.
+ON_SURFACE_M = 1e-5
+
 
 @njit(cache=True, nogil=True)
 def list_surface(sdf: NDArray[np.float32]) -> tuple[Ints, Ints]:
@@ -181,19 +184,14 @@ def crossing_along_normal(sdf: NDArray[np.float32], local: Ints, normals: Array,
     for n in range(local.shape[0]):
         x, y, z = float(local[n, 0]), float(local[n, 1]), float(local[n, 2])
         u, v, w = normals[n]
-        inner = 0.0
-        outer = 0.0
-        found = False
-        while outer < reach:
+        inner = outer = 0.0
+        f_inner = f_outer = float(sdf[local[n, 0], local[n, 1], local[n, 2]])
+        while outer < reach and f_outer < 0.0:
+            inner, f_inner = outer, f_outer
             outer += 0.5
-            if trilinear(sdf, x + outer * u, y + outer * v, z + outer * w) >= 0.0:
-                found = True
-                break
-            inner = outer
-        if not found:
+            f_outer = trilinear(sdf, x + outer * u, y + outer * v, z + outer * w)
+        if f_outer < 0.0:
             continue
-        f_inner = trilinear(sdf, x + inner * u, y + inner * v, z + inner * w)
-        f_outer = trilinear(sdf, x + outer * u, y + outer * v, z + outer * w)
         for _ in range(4):
             step = inner + (outer - inner) * min(max(f_inner / (f_inner - f_outer), 0.05), 0.95)
             f = trilinear(sdf, x + step * u, y + step * v, z + step * w)
@@ -201,6 +199,8 @@ def crossing_along_normal(sdf: NDArray[np.float32], local: Ints, normals: Array,
                 inner, f_inner = step, f
             else:
                 outer, f_outer = step, f
+            if abs(f) < ON_SURFACE_M:
+                break
         out[n] = inner + (outer - inner) * (f_inner / (f_inner - f_outer))
     return out
 
