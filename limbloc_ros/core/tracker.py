@@ -62,14 +62,15 @@ class Tracker:
     )  # fmt: skip
     #: Every so many frames one of the limbs has its turn to be looked for elsewhere, in so many places; by how much of
     #: the energy it and what the silhouettes add must be lower there.
-    TURN, PLACES, LIMB_GAIN = 3, 1, 0.03
+    TURN, PLACES, LIMB_GAIN = 2, 1, 0.03
     #: When the cost is so much above the usual one, the figure is first carried on by so many steps, and then all limbs
     #: are checked at once; each time in vain, the wait doubles, up to this, unless the cost rises as much once more.
     #: Then a limb that settles where it was counts as well: it may have come back along a better way.
     LIMB_DOUBT, MORE_STEPS, LONGEST_DOUBT = 1.25, 10, 8
     #: The figure is carried along with the firm weights of the search, which lead from further off; so many more steps
-    #: with the final ones put its joints in their places.
-    FINAL_STEPS = 4
+    #: with the final ones put its joints in their places. (With 4, or with limbs checked in every third frame, wrists
+    #: of raised arms stay 10 to 20 cm behind in rough hulls.)
+    FINAL_STEPS = 6
     #: People do not change their size, and one hull says little of it: what a squared deviation from the mean shape so
     #: far costs (m^2) per frame in that mean, and how many frames count.
     SIZE_WEIGHT, REMEMBERED = 1e-4, 20
