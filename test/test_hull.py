@@ -119,7 +119,7 @@ def test_largest_component_drops_the_rest_and_its_shell():
 @pytest.mark.parametrize("share", [0.0, 0.2, 0.35, 1.0])
 def test_parts_are_numbered_in_the_order_of_their_first_voxels(share):
     solid = np.random.default_rng(3).random((9, 7, 12)) < share
-    labels, sizes, boxes = hulls.kernels.label_components(np.where(solid, 0.01, 0.03), 0.02)
+    labels, sizes, boxes = hulls.apart.label_components(np.where(solid, 0.01, 0.03), 0.02)
     np.testing.assert_array_equal(labels, ndimage.label(solid)[0])
     np.testing.assert_array_equal(sizes[1:], np.bincount(labels.ravel())[1:])
     expected = [[[side.start for side in box], [side.stop for side in box]] for box in ndimage.find_objects(labels)]
@@ -130,7 +130,7 @@ def test_parts_are_numbered_in_the_order_of_their_first_voxels(share):
 def test_parts_grow_along_all_axes(reach):
     part = np.random.default_rng(reach).random((7, 1, 13)) < 0.03
     grown = ndimage.binary_dilation(part, np.ones((2 * reach + 1,) * 3, bool))
-    np.testing.assert_array_equal(hulls.kernels.grow_part(part, reach), grown)
+    np.testing.assert_array_equal(hulls.apart.grow_part(part, reach), grown)
 
 
 def test_largest_component_keeps_who_cut_where_it_was():

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from limbloc_ros.core import _block_kernels as near
+from limbloc_ros.core import _component_kernels as apart
 from limbloc_ros.core import _hull_kernels as kernels
 from limbloc_ros.core import _mending_kernels as mending_kernels
 from limbloc_ros.core import mending
@@ -284,7 +285,7 @@ class _Parts(NamedTuple):
 
 
 def _parts(hull: Hull) -> _Parts:
-    return _Parts(*kernels.label_components(hull.sdf, np.float32(hull.voxel_m)))
+    return _Parts(*apart.label_components(hull.sdf, np.float32(hull.voxel_m)))
 
 
 def _people_among(hull: Hull, hull_parts: _Parts, silhouettes: Silhouettes, config: HullConfig) -> list[int]:
@@ -338,10 +339,10 @@ def _share_alone(cover: NDArray[np.uint8], total: NDArray[np.uint8], silhouettes
 def _with_parts(hull: Hull, parts: _Parts, keep: list[int]) -> Hull:
     """The hull with only some of its connected parts and the shell around them."""
     band, reach = np.float32(hull.band_m), math.ceil(hull.band_m / hull.voxel_m)
-    stays, corner = kernels.parts_and_shell(hull.sdf, band, parts.labels, parts.boxes, np.array(keep), reach)
+    stays, corner = apart.parts_and_shell(hull.sdf, band, parts.labels, parts.boxes, np.array(keep), reach)
     i, j, k = (low + int(first) for low, first in zip(hull.index_min, corner, strict=True))
-    sdf = kernels.copy_where(hull.sdf, corner, stays, band)
-    cut_by = None if hull.cut_by is None else kernels.copy_where(hull.cut_by, corner, stays, np.uint8(NOBODY))
+    sdf = apart.copy_where(hull.sdf, corner, stays, band)
+    cut_by = None if hull.cut_by is None else apart.copy_where(hull.cut_by, corner, stays, np.uint8(NOBODY))
     return replace(hull, index_min=(i, j, k), sdf=sdf, cut_by=cut_by)
 
 
