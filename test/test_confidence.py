@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from limbloc_ros.core import confidence
-from limbloc_ros.core.confidence import DOUBTFUL, SURE, WARY_FRAMES, Wariness, risk_of
+from limbloc_ros.core.confidence import DOUBTFUL, SURE, WARY_FRAMES, Wariness, likely_wrong, risk_of
 from limbloc_ros.core.figure import FigureState, place
 from limbloc_ros.core.hull import Hull
 from limbloc_ros.core.pose import Pose
@@ -86,6 +86,22 @@ def test_a_figure_of_no_such_hull_and_half_a_person():
     cut = block()
     cut.sdf[-2, 3:-3, 3:-3] = -0.05  # up to the wall, and outside beyond it
     assert "carve volume" in asked(hull=dataclasses.replace(cut, sdf=cut.sdf))
+
+
+def test_what_is_worth_another_search(monkeypatch):
+    hull, state = block(), FigureState.standing(np.array([0.0, 0.0, 0.95]))
+    monkeypatch.setattr(confidence, "xor_energy", lambda hull, placed: 0.3)
+    said = [SHOWN, 0.04]
+    monkeypatch.setattr(confidence, "_silhouettes_say", lambda hull, surface, flesh, others: tuple(said))
+    assert not likely_wrong(state, hull, None)
+    said[1] = 0.19  # an outline passes the figure by 19 cm
+    assert likely_wrong(state, hull, None)
+    said[:] = SHOWN * [[1.0, 1.0, 1.0], [0.05, 0.05, 1.0]], 0.04
+    assert likely_wrong(state, hull, None)
+    # half a person is doubted, but nobody would find a better figure of that hull
+    cut = hull.sdf.copy()
+    cut[-2, 3:-3, 3:-3] = -0.05
+    assert not likely_wrong(state, dataclasses.replace(hull, sdf=cut), None)
 
 
 def test_a_followed_figure_that_was_doubted_must_be_clearly_right_for_some_frames():

@@ -131,6 +131,28 @@ def test_another_seed_finds_the_same_person():
     assert np.median(np.linalg.norm(joints[0] - joints[1], axis=1)) < 0.02
 
 
+def test_a_doubtful_figure_is_searched_for_once_more():
+    name, frame = PEOPLE[0]
+    hull = hull_of(name, frame)
+    surface = extract_surface(hull)
+    first = replace(engine_robust.QUICK, torsos=1, leg_pairs=1, starts=1, arm_repairs=1, certain=1.0, enough=1.0)
+    second = replace(first, torsos=2, starts=2)
+    asked = []
+
+    def fit(doubtful):
+        return fit_from_scratch(hull, surface, 0, None, (first, second), doubtful)
+
+    once = fit(lambda state: bool(asked.append(state)))
+    assert len(asked) == 1
+    assert asked[0] is once.state
+    np.testing.assert_array_equal(once.state.rotations, fit(None).state.rotations)
+    asked.clear()
+    twice = fit(lambda state: not asked.append(state))
+    assert len(asked) == 2
+    assert asked[0] is not asked[1] or twice.state is asked[0]
+    assert twice.verdict <= once.verdict
+
+
 def test_evidence_is_a_fair_sample():
     hull = hull_of(*PEOPLE[0])
     surface = extract_surface(hull)

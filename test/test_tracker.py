@@ -169,7 +169,8 @@ class Stand:
         monkeypatch.setattr(Tracker, "_check_limbs", self.check)
         monkeypatch.setattr(tracker.energy, "system", self.system)
 
-    def search(self, hull, surface, seed, weights, searches):
+    def search(self, hull, surface, seed, weights, searches, doubtful):
+        self.doubtful = doubtful
         self.searched.append((self.frame, seed, weights, searches))
         if self.scratch_cost is None:
             return None

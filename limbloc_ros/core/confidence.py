@@ -42,6 +42,9 @@ NO_MATCH_COST = 2.8e-4
 #: By logistic regression from 670 frames of other people, poses and cameras than the public suites have, noisy masks,
 #: loose clothes and simulated rooms among them; rounded, for what they are fitted to goes on changing.
 DOUBTFUL = 0.10
+#: Before it comes to that, a figure that is as likely wrong as this is searched for once more, and harder. (Of 426 that
+#: the quick search took for right 8 were wrong, of which 7 had such a risk; no right one had.)
+WORTH_A_SEARCH = 0.05
 #: What was wrong a moment ago mostly still is: for so many frames after a followed figure was doubted, only one that is
 #: that unlikely wrong is to be acted on. (Of 120 figures with a forearm in a box that was carried, 16 were called
 #: reliable, now none; of 120 right ones all are, as before.)
@@ -113,6 +116,26 @@ def risk_of(hull: Hull, flesh: Flesh, energy: float, shown: Array | None, passed
     return risk, max(signs, key=signs.__getitem__)
 
 
+def likely_wrong(state: FigureState, hull: Hull, surface: Surface, others: Sequence[Flesh] = ()) -> bool:
+    """Whether a figure is worth another search; arguments as in `describe_pose`."""
+    if hull.cut_area_m2 >= CUT_M2:
+        return False  # nobody would find a better one
+    placed = figure.place(state)
+    flesh = placed.flesh()
+    risk, _ = risk_of(hull, flesh, xor_energy(hull, placed), *_silhouettes_say(hull, surface, flesh, others))
+    return risk >= WORTH_A_SEARCH
+
+
+def _silhouettes_say(
+    hull: Hull, surface: Surface | None, flesh: Flesh, others: Sequence[Flesh]
+) -> tuple[Array | None, float]:
+    """How much the limbs show, if that is known, and how far outlines pass the figure, m."""
+    if surface is None:
+        return None, 0.0
+    shown = None if hull.views is None else limbs_shown(hull.views, flesh)
+    return shown, unexplained_m(hull, surface, flesh, others)
+
+
 class Wariness:
     """Of a followed figure: for some frames after it was doubted, it must be less likely wrong than otherwise."""
 
@@ -158,9 +181,7 @@ def describe_pose(
         f"{a}-{b}": float(np.linalg.norm(placed.joints[JOINT[a]] - placed.joints[JOINT[b]])) for a, b in STICK_BONES
     }
     sizes["stature"] = float(np.exp(state.shape[0]))
-    shown = None if surface is None or hull.views is None else limbs_shown(hull.views, flesh)
-    passed_m = 0.0 if surface is None else unexplained_m(hull, surface, flesh, others)
-    risk, sign = risk_of(hull, flesh, energy, shown, passed_m)
+    risk, sign = risk_of(hull, flesh, energy, *_silhouettes_say(hull, surface, flesh, others))
     if risk == 0.0 and system is not None and system.cost >= NO_MATCH_COST:
         risk, sign = 1.0, "the figure does not match the hull's surface, and what the cameras saw is not known"
     return Pose(

@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from limbloc_ros.core import engine_paper, engine_robust
 from limbloc_ros.core.camera import Camera, Rig
-from limbloc_ros.core.confidence import Wariness, describe_pose
+from limbloc_ros.core.confidence import Wariness, describe_pose, likely_wrong
 from limbloc_ros.core.config import FitConfig, HullConfig, validated
 from limbloc_ros.core.errors import NoPerson
+from limbloc_ros.core.figure import FigureState
 from limbloc_ros.core.hull import Hull, carve_silhouettes, largest_component
 from limbloc_ros.core.pose import Flesh, Pose
 from limbloc_ros.core.silhouettes import measure_silhouettes, pack_cameras
@@ -89,10 +90,14 @@ class PoseEstimator:
             hull = dataclasses.replace(hull, views=hull.views.without(others))
         surface = extract_surface(hull)
         clock.lap("surface")
+
+        def doubtful(state: FigureState) -> bool:
+            return likely_wrong(state, hull, surface, others)
+
         if self.config.temporal:
-            fit = self._tracker.follow(hull, surface)
+            fit = self._tracker.follow(hull, surface, doubtful)
         else:
-            fit = engine_robust.fit_from_scratch(hull, surface, self.config.seed)
+            fit = engine_robust.fit_from_scratch(hull, surface, self.config.seed, doubtful=doubtful)
         clock.lap("fit")
         if fit is None:
             return NoPerson("the hull holds nothing that a torso fits into")

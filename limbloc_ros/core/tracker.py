@@ -15,6 +15,7 @@ from limbloc_ros.core.engine_robust import (
     QUICK,
     SAME_PLACE_M,
     SETTLED_M,
+    Doubtful,
     Effort,
     Fit,
     KnownSize,
@@ -95,11 +96,12 @@ class Tracker:
         self._centre = np.zeros(3)
         self._size, self._sized = np.zeros(0), 0
 
-    def follow(self, hull: Hull, surface: Surface) -> Fit | None:
+    def follow(self, hull: Hull, surface: Surface, doubtful: Doubtful | None = None) -> Fit | None:
         """Fit the next frame.
 
         Args:
             hull, surface: of one person.
+            doubtful: of `fit_from_scratch`.
 
         Returns:
             the fit, or None when there is no figure yet and no torso fits into the hull.
@@ -127,7 +129,7 @@ class Tracker:
                 fit = replace(fit, unseen=unseen(fit.state, hull))
             # while there is a figure, a quick search first: what it misses is searched harder the next time
             searches = self._searches if fit is None or self._vain else self._searches[:1]
-            scratch = fit_from_scratch(hull, surface, self._seed, self._weights, searches)
+            scratch = fit_from_scratch(hull, surface, self._seed, self._weights, searches, doubtful)
             self._vain = scratch is None or (fit is not None and scratch.verdict >= fit.verdict - 0.05 * fit.judged)
             if scratch is not None and not self._vain:
                 fit, self._wait = scratch, self.PATIENCE if scratch.judged < self.DOUBTFUL_COST else 1
