@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What each replacement bought: from the paper's engine to ours, one step at a time, on the public suites.
 
-    python benchmarks/bench_ablation.py [--every N] [--steps 1-10]
+    python benchmarks/bench_ablation.py [--every N] [--steps 1-11]
 
 Every frame is fitted alone, from the same hull, by each step's engine; one thread. Columns: median distance of the 13
 limb joints in mm and, after the slash, the frames with all of them within 15 cm in %, per suite; then the median
@@ -33,6 +33,7 @@ from score import LIMB13  # noqa: E402
 from tqdm import tqdm  # noqa: E402
 
 from limbloc_ros.core import engine_paper, engine_robust  # noqa: E402
+from limbloc_ros.core.confidence import likely_wrong  # noqa: E402
 from limbloc_ros.core.config import HullConfig  # noqa: E402
 from limbloc_ros.core.energy import Weights  # noqa: E402
 from limbloc_ros.core.engine_robust import QUICK, SEARCHES, Effort  # noqa: E402
@@ -81,11 +82,16 @@ class Paper:
         return engine_robust.refine(state, evidence, weights, 12).state
 
 
-def searched(*searches: Effort) -> Callable[[Hull], FigureState | None]:
-    """Our engine with these searches, one after the other while the energy is high."""
+def searched(*searches: Effort, doubting: bool = False) -> Callable[[Hull], FigureState | None]:
+    """Our engine with these searches, one after the other while the energy is high, or the figure doubtful."""
 
     def fit(hull: Hull) -> FigureState | None:
-        found = engine_robust.fit_from_scratch(hull, extract_surface(hull), 0, None, searches)
+        surface = extract_surface(hull)
+
+        def doubtful(state: FigureState) -> bool:
+            return doubting and likely_wrong(state, hull, surface)
+
+        found = engine_robust.fit_from_scratch(hull, surface, 0, None, searches, doubtful)
         return None if found is None else found.state
 
     return fit
@@ -135,7 +141,8 @@ STEPS = (
     Step("+ each limb of the winner tried elsewhere", searched(dataclasses.replace(QUICK, enough=0.0))),
     Step("+ a second search while the energy is high", searched(*SEARCHES[:2])),
     Step("+ a third, and loose clothes", searched(*SEARCHES)),
-    Step("+ figures judged by the silhouettes: `robust`", searched(*SEARCHES), voted),
+    Step("+ figures judged by the silhouettes", searched(*SEARCHES), voted),
+    Step("+ another search when they call a figure doubtful: `robust`", searched(*SEARCHES, doubting=True), voted),
     Step("`robust`, hull by plain intersection", searched(*SEARCHES), intersected),
 )
 
