@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from limbloc_ros.core import energy, lm
 from limbloc_ros.core.energy import Evidence, Weights
 from limbloc_ros.core.engine_robust import (
+    HARDER,
     QUICK,
     SAME_PLACE_M,
     SETTLED_M,
@@ -53,13 +54,15 @@ class Tracker:
     #: live room a slow fit makes the next step longer. Each time that starting anew finds nothing better, the wait
     #: doubles, up to this: some hulls are just bad. Only after a hopeless start the next frame is tried.
     PATIENCE, LONGEST_WAIT = 8, 32
-    #: What is searched when starting anew: less than for a frame alone, for the next frames can mend it.
+    #: What is searched when starting anew: less than for a frame alone, for the next frames can mend it. All that there
+    #: is only for somebody who was not followed yet and whose figure is doubtful.
     SEARCHES = (
         QUICK,
         Effort(
             leg_pairs=2, starts=6, survivors=3, arm_repairs=2, strict=2, finalists=1, single_arms=2, single_legs=0,
-            rounds=1, shown=False,
+            rounds=1, shown=False, enough=1.0,
         ),
+        HARDER,
     )  # fmt: skip
     #: Every so many frames one of the limbs has its turn to be looked for elsewhere, in so many places; by how much of
     #: the energy it and what the silhouettes add must be lower there.
@@ -128,7 +131,7 @@ class Tracker:
             if fit is not None:
                 fit = replace(fit, unseen=unseen(fit.state, hull))
             # while there is a figure, a quick search first: what it misses is searched harder the next time
-            searches = self._searches if fit is None or self._vain else self._searches[:1]
+            searches = self._searches if fit is None else self._searches[: 2 if self._vain else 1]
             scratch = fit_from_scratch(hull, surface, self._seed, self._weights, searches, doubtful)
             self._vain = scratch is None or (fit is not None and scratch.verdict >= fit.verdict - 0.05 * fit.judged)
             if scratch is not None and not self._vain:
