@@ -191,6 +191,13 @@ class TestCleaning:
         inside = self.mask()[152 : 148 + size, 132 : 128 + size]
         assert inside.all() if filled else not inside.any()
 
+    def test_what_lies_around_a_person_is_no_hole_however_large_holes_may_be(self):
+        self.draw(slice(100, 140), slice(100, 140))
+        self.draw(slice(110, 130), slice(110, 130), 0, 0)
+        truth = np.zeros((480, 640), dtype=bool)
+        truth[100:140, 100:140] = True
+        assert iou(self.mask(max_hole_px=1_000_000), truth) > 0.98
+
     def test_a_bite_in_the_outline_is_body_and_a_cast_shadow_is_not(self):
         self.draw(slice(100, 300), slice(100, 200))
         self.draw(slice(150, 190), slice(100, 130), 30, 1.6)  # three sides body, one background

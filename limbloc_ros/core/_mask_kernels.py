@@ -183,6 +183,7 @@ def fill_holes(mask: Bits, changed: Bits, colour: Bytes, least_colour: float, le
     parts = parts_of(runs, False)
     size = np.zeros(len(runs), dtype=np.int64)
     outside = height * width  # larger than any hole, so that no sum of runs with it is taken for one
+    least = min(least, outside)
     for k in range(len(runs)):
         y, start, end = runs[k, ROW], runs[k, START], runs[k, END]
         size[parts[k]] += outside if _at_rim(y, start, end, height, width) else end - start
