@@ -35,19 +35,12 @@ from limbloc_ros.core._bit_kernels import (
     set_runs,
     spread_row,
 )
+from limbloc_ros.core._union_kernels import join
 
 Labels = NDArray[np.int32]
 
 FRACTION = 256
 """Fixed point of the outline's fraction."""
-
-
-@njit(cache=True)
-def _root(parents: Labels, run: int) -> int:
-    while parents[run] != run:
-        parents[run] = parents[parents[run]]
-        run = parents[run]
-    return run
 
 
 @njit(cache=True)
@@ -67,8 +60,7 @@ def parts_of(runs: Runs, diagonal: bool) -> Labels:
             above += 1
         other = above
         while runs[other, ROW] == row - 1 and runs[other, START] < end + reach:
-            a, b = _root(parents, run), _root(parents, other)
-            parents[max(a, b)] = min(a, b)
+            join(parents, run, other)
             other += 1
     for run in range(len(runs)):
         parents[run] = parents[parents[run]]

@@ -17,7 +17,7 @@ OFFSETS: Ints = np.array(
     [(i, j, k) for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1) if (i, j, k) != (0, 0, 0)], dtype=np.int32
 )
 
-#: A value of the field that is nobody's difference, m.
+#: A point is on the surface where the field is no further from 0 than this, m.
 ON_SURFACE_M = 1e-5
 
 
