@@ -355,8 +355,8 @@ class BackgroundModel:
 
     def _finish_learning(self) -> None:
         self._ready = True
-        spread = self._variance.max(axis=0) / np.float32(max(self._learned - 1, 1))
-        self._unrest = float(np.count_nonzero(spread > RESTLESS_SIGMA**2)) / spread.size
+        varied = self._variance.max(axis=0) / np.float32(max(self._learned - 1, 1))
+        self._unrest = float(np.count_nonzero(varied > RESTLESS_SIGMA**2)) / varied.size
         self._noise_known = self._learned >= 5
         if self._noise_known:
             # A variance from a few frames is itself noisy; neighbours share their camera's noise.
