@@ -285,7 +285,17 @@ def test_shifted_pivots_move_within_the_flesh_and_keep_limbs_straight(monkeypatc
         across = -((1 - share) * knee + share * ankle) * (1.0, 1.0, 0.0)
         np.testing.assert_allclose(shifted.spheres[calf] - plain.spheres[calf], across, atol=1e-3)
         assert mirror[1] * shifted.spheres[calf, 1] == pytest.approx(shifted.spheres[sphere["calf_L"], 1])
-    np.testing.assert_allclose((shifted.joints - plain.joints)[JOINT["torso_centre"]], [-0.005, 0.0, 0.0], atol=1e-12)
+        # with a limb's first pivot the whole line moves
+        moved = shifted.joints - plain.joints
+        first = np.array(_figure_topology.PIVOT_SHIFTS[f"upper_arm_{side}"])
+        np.testing.assert_allclose(moved[JOINT[f"shoulder_{side}"]], first, atol=1e-12)
+        across = moved[[JOINT[f"{name}_{side}"] for name in ("elbow", "wrist")], :2]
+        np.testing.assert_allclose(across, np.tile(first[:2], (2, 1)), atol=1e-7)
+    # a foot's joints stay in its flesh
+    toe, ball = JOINT["toe_R"], sphere["ball_R"]
+    within = [who.joints[toe] - who.spheres[ball] for who in (shifted, plain)]
+    np.testing.assert_allclose(within[0] - within[1], [0.003, -0.008, -0.015], atol=1e-12)
+    np.testing.assert_allclose(moved[JOINT["torso_centre"]], [-0.005, 0.0, 0.0], atol=1e-12)
     for name in ("hip_L", "pelvis_centre"):
         np.testing.assert_array_equal(shifted.joints[JOINT[name]], plain.joints[JOINT[name]])
 

@@ -92,7 +92,8 @@ JUDGED_CLOTHING = 2e-5
 #: figure often has the higher energy (a limb that one mask lost is not in the hull), but hardly ever the higher sum.
 SEEN_WEIGHT = 1e-2
 #: One search after the other, until the energy is low and the figure not doubtful: most are found easily. Of 492 frames
-#: the first search ended below 3e-4 in 426; 8 of these were wrong, of which 7 were doubtful, as no right one was.
+#: the first search ended below 3e-4 in 426; 8 of these were wrong, of which 7 were doubtful, as no right one was (the
+#: frames by which both bounds were chosen).
 QUICK = Effort(
     torsos=2, leg_pairs=2, starts=3, survivors=2, arm_repairs=1, strict=2, single_arms=2, single_legs=1, rounds=1,
     finalists=1, candidates=32, enough=3e-4, certain=1.6e-4, shown=False,
@@ -331,7 +332,8 @@ def fit_from_scratch(
         if best is None or fit.verdict < best.verdict:
             best = fit
         # of the energy alone: what silhouettes cost depends on how ragged they are
-        if best.judged < effort.enough and not (doubtful is not None and doubtful(best.state)):
+        last = n + 1 == len(searches)
+        if best.judged < effort.enough and (last or doubtful is None or not doubtful(best.state)):
             break
         for _ in range(effort.last_rounds):
             better = _with_other_limbs(best, scene, effort)

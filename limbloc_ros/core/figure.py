@@ -120,12 +120,13 @@ def proportions() -> Proportions:
 
 
 def _shift_joints(bone_offsets: Array, point_bones: list[int], point_offsets: Array) -> None:
-    """Move pivots and joints as the topology says, in place; flesh stays where it is while nothing is bent.
+    """Move pivots within the flesh, and joints, as the topology says, in place.
 
-    The two bones of a limb have their pivots on one line, from which all angles are counted. So where a pivot inside a
-    limb moves across that line, the flesh around it moves the other way instead.
+    The bones of a limb have their pivots on one line, from which all angles are counted. Along it pivots move and the
+    flesh stays where it is while nothing is bent. Where a pivot inside a limb should move across the line, the flesh
+    around it moves the other way instead; where the limb's first pivot does, the whole line moves.
     """
-    unmoved = bone_offsets[:, :, 0].copy()
+    unmoved, heights = bone_offsets[:, :, 0].copy(), point_offsets[:, 2, 0].copy()
     carriers = np.array(point_bones)
     marks_pivot = (np.arange(len(carriers)) >= N_SPHERES) & ~point_offsets.any(axis=(1, 2))
     for name, shift in PIVOT_SHIFTS.items():
@@ -138,11 +139,11 @@ def _shift_joints(bone_offsets: Array, point_bones: list[int], point_offsets: Ar
         bone_offsets[nexts, :, 0] -= along
         # Flesh between two pivots follows both of them, by how near they are.
         for n in np.flatnonzero((carriers == bone) & ~marks_pivot):
-            share = 1.0 - np.clip(point_offsets[n, 2, 0] / unmoved[nexts[0], 2], 0.0, 1.0) if len(nexts) else 1.0
+            share = 1.0 - np.clip(heights[n] / unmoved[nexts[0], 2], 0.0, 1.0) if nexts else 1.0
             point_offsets[n, :, 0] -= along + share * across
         if within_limb:
             for n in np.flatnonzero((carriers == parent) & ~marks_pivot):
-                point_offsets[n, :, 0] -= np.clip(point_offsets[n, 2, 0] / unmoved[bone, 2], 0.0, 1.0) * across
+                point_offsets[n, :, 0] -= np.clip(heights[n] / unmoved[bone, 2], 0.0, 1.0) * across
     for name, shift in JOINT_SHIFTS.items():
         point_offsets[N_SPHERES + JOINT_NAMES.index(name), :, 0] += np.array(shift) / REFERENCE_STATURE_M
 
