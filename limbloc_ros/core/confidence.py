@@ -42,8 +42,8 @@ NO_MATCH_COST = 2.8e-4
 #: By logistic regression from 670 frames of other people, poses and cameras than the public suites have, noisy masks,
 #: loose clothes and simulated rooms among them; rounded, for what they are fitted to goes on changing.
 DOUBTFUL = 0.10
-#: Before it comes to that, a figure that is as likely wrong as this is searched for once more, and harder. (When this was
-#: chosen, 8 of 426 that the quick search took for right were wrong; 7 of these had such a risk, and no right one.)
+#: Before it comes to that, a figure that is as likely wrong as this is searched for once more, and harder. (When this
+#: was chosen, 8 of 426 that the quick search took for right were wrong; 7 of these had such a risk, and no right one.)
 WORTH_A_SEARCH = 0.05
 #: What was wrong a moment ago mostly still is: for so many frames after a followed figure was doubted, only one that is
 #: that unlikely wrong is to be acted on. (Of 120 figures with a forearm in a box that was carried, 16 were called
