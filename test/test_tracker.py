@@ -136,16 +136,21 @@ def test_an_arm_that_slipped_into_the_trunk_is_found_again(monkeypatch):
 def test_a_limb_that_moves_fast_is_not_lost():
     """Every third frame of a waving person: the hand moves by half a forearm from one to the next."""
     waving = load_case(BENCHMARK / "public/seq_wave")
-    carver, follower = Carver(waving.rig), Tracker(seed=0)
-    truth = np.stack([waving.truth[joint] for joint in ("wrist_L", "wrist_R")], axis=1)
-    jumps, off = [], []
-    for frame in range(0, 24, 3):
-        hull = carver.carve(waving.masks(frame))
-        joints = place(follower.follow(hull, extract_surface(hull)).state).joints
-        off.append(np.linalg.norm(joints[[JOINT["wrist_L"], JOINT["wrist_R"]]] - truth[frame], axis=1).max())
-        jumps.append(np.linalg.norm(truth[frame] - truth[max(frame - 3, 0)], axis=1).max())
-    assert max(jumps) > 0.15
-    assert max(off) < 0.10
+    carver = Carver(waving.rig)
+    frames = range(0, 24, 3)
+    wrists = [JOINT["wrist_L"], JOINT["wrist_R"]]
+    truth = np.stack([waving.truth[JOINT_NAMES[wrist]] for wrist in wrists], axis=1)[list(frames)]
+    assert np.linalg.norm(np.diff(truth, axis=0), axis=2).max() > 0.15
+    hulls = [carver.carve(waving.masks(frame)) for frame in frames]
+    surfaces = [extract_surface(hull) for hull in hulls]
+    lost = 0
+    for seed in range(4):
+        follower = Tracker(seed=seed)
+        joints = [place(follower.follow(*seen).state).joints[wrists] for seen in zip(hulls, surfaces, strict=True)]
+        off = np.linalg.norm(np.array(joints) - truth, axis=2).max(axis=1) > 0.10
+        assert not (off[1:] & off[:-1]).any()  # a hand that was left behind once is back in the next frame
+        lost += off.sum()
+    assert lost <= 1
 
 
 # when a fit is doubted
@@ -160,7 +165,7 @@ class Stand:
     def __init__(self, monkeypatch):
         self.scratch_cost, self.costs = 1e-4, {}
         self.searched, self.refined, self.checked, self.guessed = [], [], [], []
-        self.found = set()
+        self.found, self.cut = set(), set()
         self.frame = 0
         monkeypatch.setattr(tracker, "fit_from_scratch", self.search)
         monkeypatch.setattr(tracker, "refine", self.refine)
@@ -199,7 +204,8 @@ class Stand:
         for _ in range(frames):
             self.frame += 1
             centre = np.zeros(3) if centres is None else centres[self.frame]
-            fit = follower.follow(None, SimpleNamespace(points=centre + np.array([[1.0, 0, 0], [-1.0, 0, 0]])))
+            hull = SimpleNamespace(cut_area_m2=0.1 if self.frame in self.cut else 0.0)
+            fit = follower.follow(hull, SimpleNamespace(points=centre + np.array([[1.0, 0, 0], [-1.0, 0, 0]])))
             costs.append(None if fit is None else fit.system.cost)
         return costs
 
@@ -224,7 +230,7 @@ def test_calm_frames_are_followed_and_each_limb_checked_now_and_then(stand):
 
 def test_all_limbs_are_checked_at_once_when_the_cost_rises_and_ever_less_often_in_vain(stand, monkeypatch):
     monkeypatch.setattr(Tracker, "TURN", 99)
-    monkeypatch.setattr(Tracker, "_doubts", lambda self, cost: False)
+    monkeypatch.setattr(Tracker, "_doubts", lambda self, cost, cut: False)
     stand.costs = dict.fromkeys(range(3, 9), 2e-4) | {9: 3.9e-4, 10: 3.9e-4} | dict.fromkeys(range(11, 20), 6e-4)
     stand.run(Tracker(seed=0), 19)
     # at 9 the wait is over; at 11 it is not, but the cost has risen once more
@@ -301,6 +307,14 @@ def test_nobody_and_somebody_again(stand):
     stand.scratch_cost = 2e-4
     assert stand.run(follower, 2) == [2e-4, 1e-4]
     assert stand.search_frames == [1, 2, 3, 4]
+
+
+def test_half_a_person_in_the_doorway_is_searched_quickly_and_again_when_whole(stand):
+    stand.cut = set(range(1, 6))
+    stand.scratch_cost = 9e-4  # hopeless
+    stand.costs = dict.fromkeys(range(1, 20), 10e-4)
+    stand.run(Tracker(seed=0), 7)
+    assert [(frame, len(searches)) for frame, *_, searches in stand.searched] == [(1, 1), (6, 1), (7, 1)]
 
 
 def test_reset_forgets_everything(stand):

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from limbloc_ros.core import energy, lm
+from limbloc_ros.core.confidence import CUT_M2
 from limbloc_ros.core.energy import Evidence, Weights
 from limbloc_ros.core.engine_robust import (
     HARDER,
@@ -52,7 +53,8 @@ class Tracker:
     DOUBT, DOUBTFUL_COST = 1.35, 4.5e-4
     #: ... but starting anew, which takes as long as many followed frames, is tried only every so many frames: in a
     #: live room a slow fit makes the next step longer. Each time that starting anew finds nothing better, the wait
-    #: doubles, up to this: some hulls are just bad. Only after a hopeless start the next frame is tried.
+    #: doubles, up to this: some hulls are just bad. Only after a hopeless start the next frame is tried, and that in
+    #: which somebody who reached out of the carve volume is whole.
     PATIENCE, LONGEST_WAIT = 8, 32
     #: What is searched when starting anew: less than for a frame alone, for the next frames can mend it. All that there
     #: is only for somebody who was not followed yet and whose figure is doubtful.
@@ -95,7 +97,7 @@ class Tracker:
         self._usual_cost = 0.0
         self._frame = 0
         self._last_scratch = -self.PATIENCE
-        self._wait, self._vain = self.PATIENCE, False
+        self._wait, self._vain, self._last_cut = self.PATIENCE, False, False
         self._centre = np.zeros(3)
         self._size, self._sized = np.zeros(0), 0
 
@@ -126,16 +128,19 @@ class Tracker:
             final = refine(result.state, evidence, self._weights, self.FINAL_STEPS, size)
             self._remember(final.state.shape)
             fit = Fit(final.state, final.system, judged=judged)
-        if fit is None or self._doubts(fit.judged):
-            self._last_scratch = self._frame
+        cut = hull.cut_area_m2 >= CUT_M2
+        if fit is None or self._doubts(fit.judged, cut):
+            self._last_scratch, self._last_cut = self._frame, cut
             if fit is not None:
                 fit = replace(fit, unseen=unseen(fit.state, hull))
-            # while there is a figure, a quick search first: what it misses is searched harder the next time
-            searches = self._searches if fit is None else self._searches[: 2 if self._vain else 1]
+            # while there is a figure, a quick search first: what it misses is searched harder the next time; half a
+            # person is not worth more, as in the doorway
+            hard = self._vain and not cut
+            searches = self._searches if fit is None and not cut else self._searches[: 2 if hard else 1]
             scratch = fit_from_scratch(hull, surface, self._seed, self._weights, searches, doubtful)
             self._vain = scratch is None or (fit is not None and scratch.verdict >= fit.verdict - 0.05 * fit.judged)
             if scratch is not None and not self._vain:
-                fit, self._wait = scratch, self.PATIENCE if scratch.judged < self.DOUBTFUL_COST else 1
+                fit, self._wait = scratch, self.PATIENCE if cut or scratch.judged < self.DOUBTFUL_COST else 1
                 self._size, self._sized = scratch.state.shape, 1
             else:
                 self._wait = min(2 * self._wait, self.LONGEST_WAIT)
@@ -164,8 +169,9 @@ class Tracker:
         self._sized = min(self._sized + 1, 2 * self.REMEMBERED)
         self._size = self._size + (shape - self._size) / self._sized
 
-    def _doubts(self, cost: float) -> bool:
-        waited = self._frame - self._last_scratch >= self._wait
+    def _doubts(self, cost: float, cut: bool) -> bool:
+        whole_now = self._last_cut and not cut
+        waited = self._frame - self._last_scratch >= (1 if whole_now else self._wait)
         return waited and (cost > self.DOUBT * self._usual_cost or cost > self.DOUBTFUL_COST)
 
     def _with_limbs_checked(
