@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from limbloc_ros.core import energy, lm
-from limbloc_ros.core.confidence import CUT_M2
 from limbloc_ros.core.energy import Evidence, Weights
 from limbloc_ros.core.engine_robust import (
     HARDER,
@@ -53,9 +52,11 @@ class Tracker:
     DOUBT, DOUBTFUL_COST = 1.35, 4.5e-4
     #: ... but starting anew, which takes as long as many followed frames, is tried only every so many frames: in a
     #: live room a slow fit makes the next step longer. Each time that starting anew finds nothing better, the wait
-    #: doubles, up to this: some hulls are just bad. Only after a hopeless start the next frame is tried, and that in
-    #: which somebody who reached out of the carve volume is whole.
+    #: doubles, up to this: some hulls are just bad. Only after a hopeless start the next frame is tried.
     PATIENCE, LONGEST_WAIT = 8, 32
+    #: A hull that the walls of the carve volume cut by so much, m^2 (an arm is a hundredth), is half a person in the
+    #: doorway: not worth more than a quick search, until it is whole.
+    HALF_M2 = 0.10
     #: What is searched when starting anew: less than for a frame alone, for the next frames can mend it. All that there
     #: is only for somebody who was not followed yet and whose figure is doubtful.
     SEARCHES = (
@@ -112,6 +113,7 @@ class Tracker:
             the fit, or None when there is no figure yet and no torso fits into the hull.
         """
         self._frame += 1
+        cut = hull.cut_area_m2 >= self.HALF_M2
         fit: Fit | None = None
         centre = surface.points.mean(axis=0)
         moved, self._centre = centre - self._centre, centre
@@ -123,18 +125,17 @@ class Tracker:
             size = KnownSize(self._size, self.SIZE_WEIGHT * min(self._sized, self.REMEMBERED))
             steps = 8 if np.abs(moved).max() < 0.1 else 20
             result = refine(guesses[best], evidence, self._firm, steps, size, systems[best])
-            result = self._with_limbs_checked(result, hull, surface, evidence, size)
+            if not cut:
+                result = self._with_limbs_checked(result, hull, surface, evidence, size)
             judged = result.system.cost - size.cost(result.state.shape)
             final = refine(result.state, evidence, self._weights, self.FINAL_STEPS, size)
             self._remember(final.state.shape)
             fit = Fit(final.state, final.system, judged=judged)
-        cut = hull.cut_area_m2 >= CUT_M2
         if fit is None or self._doubts(fit.judged, cut):
             self._last_scratch, self._last_cut = self._frame, cut
             if fit is not None:
                 fit = replace(fit, unseen=unseen(fit.state, hull))
-            # while there is a figure, a quick search first: what it misses is searched harder the next time; half a
-            # person is not worth more, as in the doorway
+            # while there is a figure, a quick search first: what it misses is searched harder the next time
             hard = self._vain and not cut
             searches = self._searches if fit is None and not cut else self._searches[: 2 if hard else 1]
             scratch = fit_from_scratch(hull, surface, self._seed, self._weights, searches, doubtful)
