@@ -86,9 +86,11 @@ class Graph:
         self.node.destroy_node()
 
     def poll(self):
-        header = make_header(self.node.get_clock().now().nanoseconds, "room")
-        for output in self.outputs:
-            output.publish(joints_to_message(np.ones((len(JOINT_NAMES), 3)), header))
+        # poses that come before the true ones are heard have no error to be shown
+        if all(output.get_subscription_count() for output in self.outputs):
+            header = make_header(self.node.get_clock().now().nanoseconds, "room")
+            for output in self.outputs:
+                output.publish(joints_to_message(np.ones((len(JOINT_NAMES), 3)), header))
         return True
 
 
