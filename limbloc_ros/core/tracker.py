@@ -135,9 +135,11 @@ class Tracker:
             self._last_scratch, self._last_cut = self._frame, cut
             if fit is not None:
                 fit = replace(fit, unseen=unseen(fit.state, hull))
-            # while there is a figure, a quick search first: what it misses is searched harder the next time
-            hard = self._vain and not cut
-            searches = self._searches if fit is None and not cut else self._searches[: 2 if hard else 1]
+            searches = self._searches
+            if cut or (fit is not None and not self._vain):
+                searches = searches[:1]
+            elif fit is not None:  # what the quick search missed is searched harder the next time
+                searches = searches[:2]
             scratch = fit_from_scratch(hull, surface, self._seed, self._weights, searches, doubtful)
             self._vain = scratch is None or (fit is not None and scratch.verdict >= fit.verdict - 0.05 * fit.judged)
             if scratch is not None and not self._vain:
