@@ -96,6 +96,15 @@ def test_the_same_frames_give_the_same_bits():
     np.testing.assert_array_equal(runs[0], runs[1])
 
 
+def test_bones_keep_turning_without_shrinking():
+    """A turn that goes on is a product of three rotations, which triples what rounding left of their lengths."""
+    follower = Tracker(seed=0)
+    back_and_forth = [*FRAMES, *FRAMES[::-1]]
+    for frame in 8 * back_and_forth:
+        R = follow(follower, frame).state.rotations
+    np.testing.assert_allclose(R.transpose(0, 2, 1) @ R, np.broadcast_to(np.eye(3), R.shape), atol=1e-9)
+
+
 def test_a_jump_is_followed_by_the_centre_of_the_surface():
     follower = Tracker(seed=0)
     follow(follower, 20)
