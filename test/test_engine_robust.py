@@ -14,7 +14,7 @@ from limbloc_ros.core._figure_kernels import exp_so3
 from limbloc_ros.core.camera import Camera, Rig
 from limbloc_ros.core.config import HullConfig
 from limbloc_ros.core.energy import Weights, system
-from limbloc_ros.core.engine_robust import KnownSize, fit_from_scratch, gather_evidence, outline_rays, refine
+from limbloc_ros.core.engine_robust import fit_from_scratch, gather_evidence, outline_rays, refine
 from limbloc_ros.core.hull import NOBODY as NOBODY_CUT
 from limbloc_ros.core.hull import Hull
 from limbloc_ros.core.pipeline import Carver
@@ -280,28 +280,6 @@ def test_refinement_lowers_the_energy_and_keeps_a_fit():
         assert result.system.cost == system(result.state, evidence, Weights()).cost
         shift = figure.place(result.state).joints - figure.place(fit.state).joints
         assert np.median(np.linalg.norm(shift, axis=1)) < 0.01
-
-
-def test_a_known_size_is_kept_as_far_as_it_weighs():
-    name, frame = PEOPLE[0]
-    hull, fit = hull_of(name, frame), fit_of(name, frame)
-    evidence = gather_evidence(hull, extract_surface(hull), 600, np.random.default_rng(1))
-    known = fit.state.shape + np.linspace(-0.2, 0.2, len(fit.state.shape))
-    off = []
-    for weight in (0.0, 1e-5, 1e-3, 1.0):
-        size = KnownSize(known, weight)
-        result = refine(fit.state, evidence, Weights(), 40, size)
-        deviation = result.state.shape - known
-        off.append(np.linalg.norm(deviation))
-        plain = system(result.state, evidence, Weights()).cost
-        assert result.system.cost == pytest.approx(plain + weight * float(deviation @ deviation))
-    assert off == sorted(off, reverse=True)
-    assert off[-1] < 0.01
-    assert off[0] > 0.3
-    free = refine(fit.state, evidence, Weights(), 40)
-    np.testing.assert_array_equal(
-        free.state.to_vector(), refine(fit.state, evidence, Weights(), 40, KnownSize(known, 0.0)).state.to_vector()
-    )
 
 
 # hulls that hold nobody

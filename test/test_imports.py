@@ -51,6 +51,7 @@ CORE_ORDER = (
     "simplex",
     "lm",
     "energy",
+    "priors",
     "paper_energy",
     "directions",
     "anchors",

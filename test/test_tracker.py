@@ -79,6 +79,22 @@ def test_a_person_keeps_the_size_while_being_followed(monkeypatch):
     assert remembered < 0.5 * spread()
 
 
+def test_inertia_steadies_the_joints(monkeypatch):
+    frames = range(20, 36)
+    truth = np.array([truth_of(frame) for frame in frames])
+
+    def jitter():
+        follower = Tracker(seed=0)
+        joints = np.array([place(follow(follower, frame).state).joints for frame in frames])
+        return np.linalg.norm(np.diff(joints - truth, 2, axis=0), axis=2).mean(), np.linalg.norm(joints - truth, axis=2)
+
+    steady, near = jitter()
+    monkeypatch.setattr(Tracker, "INERTIA", 0.0)
+    loose, near_without = jitter()
+    assert steady < 0.9 * loose
+    assert np.median(near) < 1.1 * np.median(near_without)
+
+
 def test_the_tracker_starts_from_the_frame_before_until_it_is_reset():
     follower = Tracker(seed=0)
     alone = follow(follower, 20).state.to_vector()
@@ -192,7 +208,7 @@ class Stand:
             FigureState.standing([0.0, 0.0, 1.0]), SimpleNamespace(cost=self.scratch_cost), judged=self.scratch_cost
         )
 
-    def refine(self, state, evidence, weights, iterations, size=None, known=None):
+    def refine(self, state, evidence, weights, iterations, priors=(), known=None):
         if iterations != Tracker.FINAL_STEPS:
             self.refined.append((self.frame, state, iterations))
         cost = self.costs.get(self.frame, 1e-4)
@@ -295,6 +311,16 @@ def test_a_clearly_better_fit_replaces_the_followed_one(stand):
     stand.scratch_cost = 0.94 * 6e-4
     assert stand.run(follower, 1) == [pytest.approx(0.94 * 6e-4)]
     assert stand.search_frames == [1, 9]
+
+
+def test_a_figure_found_anew_is_not_carried_on_as_the_wrong_one_turned(stand):
+    stand.costs = {9: 6e-4}
+    stand.scratch_cost = 1e-4
+    follower = Tracker(seed=0)
+    stand.run(follower, 11)
+    assert stand.search_frames == [1, 9]
+    guesses = {frame: [f for f, _ in stand.guessed].count(frame) for frame in range(2, 12)}
+    assert guesses == {2: 1} | dict.fromkeys(range(3, 10), 2) | {10: 1, 11: 2}
 
 
 @pytest.mark.parametrize(("above", "searched"), [(0.999, [1, 9]), (1.001, [1, 9, 25])])

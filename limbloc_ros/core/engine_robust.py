@@ -14,6 +14,7 @@ from limbloc_ros.core.energy import Evidence, Weights
 from limbloc_ros.core.figure import FigureState
 from limbloc_ros.core.hull import Hull
 from limbloc_ros.core.limb_pairs import best_limbs, limb_pairs, with_limb
+from limbloc_ros.core.priors import Prior
 from limbloc_ros.core.search import ARM, LEG, Medial
 from limbloc_ros.core.surface import Surface
 from limbloc_ros.core.views import Views
@@ -167,25 +168,12 @@ def outline_rays(hull: Hull, surface: Surface, rows: NDArray[np.int64]) -> Array
     return np.where(known[:, None], rays, 0.0)
 
 
-@dataclass(frozen=True)
-class KnownSize:
-    """What earlier frames say of a person's size: a shape, and how much (m^2) a squared deviation from it costs."""
-
-    shape: Array
-    weight: float
-
-    def cost(self, shape: Array) -> float:
-        """What a shape costs, m^2."""
-        deviation = shape - self.shape
-        return self.weight * float(deviation @ deviation)
-
-
 def refine(
     state: FigureState,
     evidence: Evidence,
     weights: Weights,
     iterations: int,
-    size: KnownSize | None = None,
+    priors: Sequence[Prior] = (),
     known: lm.System | None = None,
 ) -> lm.LmResult[FigureState]:
     """Levenberg-Marquardt on all parameters at once; `known` is `energy.system` of the state, where that is known."""
@@ -194,26 +182,19 @@ def refine(
     step[3 + figure.N_DOF] = 0.1
     step[4 + figure.N_DOF :] = 1.0
 
-    def sized(system: lm.System, s: FigureState) -> lm.System:
-        return system if size is None else _sized(system, s.shape, size)
+    def with_priors(system: lm.System, s: FigureState) -> lm.System:
+        for prior in priors:
+            system = prior.added_to(system, s)
+        return system
 
     return lm.minimise(
-        lambda s: sized(energy.system(s, evidence, weights), s),
+        lambda s: with_priors(energy.system(s, evidence, weights), s),
         lambda s, delta: s.moved(delta),
         state,
         iterations=iterations,
         largest_step=step,
-        known=None if known is None else sized(known, state),
+        known=None if known is None else with_priors(known, state),
     )
-
-
-def _sized(system: lm.System, shape: Array, size: KnownSize) -> lm.System:
-    deviation = shape - size.shape
-    gradient, matrix = system.gradient.copy(), system.matrix.copy()
-    rows = np.arange(len(gradient) - len(shape), len(gradient))
-    gradient[rows] += size.weight * deviation
-    matrix[rows, rows] += size.weight
-    return lm.System(system.cost + size.cost(shape), gradient, matrix)
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from limbloc_ros.core import energy, lm
+from limbloc_ros.core import energy, figure, lm
 from limbloc_ros.core.energy import Evidence, Weights
 from limbloc_ros.core.engine_robust import (
     HARDER,
@@ -19,7 +19,6 @@ from limbloc_ros.core.engine_robust import (
     Doubtful,
     Effort,
     Fit,
-    KnownSize,
     apart_m,
     firm,
     fit_from_scratch,
@@ -31,6 +30,7 @@ from limbloc_ros.core.engine_robust import (
 )
 from limbloc_ros.core.figure import BONE, FigureState
 from limbloc_ros.core.hull import Hull
+from limbloc_ros.core.priors import Inertia, KnownSize
 from limbloc_ros.core.search import ARM, LEG, LimbKind, Medial
 from limbloc_ros.core.surface import Surface
 
@@ -78,9 +78,13 @@ class Tracker:
     #: with the final ones put its joints in their places. (With 4, or with limbs checked in every third frame, wrists
     #: of raised arms stay 10 to 20 cm behind in rough hulls.)
     FINAL_STEPS = 6
-    #: People do not change their size, and one hull says little of it: what a squared deviation from the mean shape so
-    #: far costs (m^2) per frame in that mean, and how many frames count.
-    SIZE_WEIGHT, REMEMBERED = 1e-4, 20
+    #: People do not change their size, and one hull says little of it: what a deviation of one standard deviation from
+    #: the mean shape so far costs (m^2) per frame in that mean, and how many frames count.
+    SIZE_WEIGHT, REMEMBERED = 2e-5, 20
+    #: Joints go on moving by this share of their last step; what it costs in the final refinement that they do not, and
+    #: from which distance on that says that they move otherwise. (All of the step would be less jitter still, but
+    #: carries limbs beyond their places when they stop; four times the weight leaves turning people behind.)
+    PACE, INERTIA, INERTIA_WIDTH_M = 0.5, 0.03, 0.03
     #: Surface points that a figure is carried along on.
     POINTS = 700
 
@@ -115,6 +119,7 @@ class Tracker:
         self._frame += 1
         cut = hull.cut_area_m2 >= self.HALF_M2
         fit: Fit | None = None
+        before = self._last
         centre = surface.points.mean(axis=0)
         moved, self._centre = centre - self._centre, centre
         if self._last is not None:
@@ -124,11 +129,12 @@ class Tracker:
             best = min(range(len(guesses)), key=lambda n: systems[n].cost)
             size = KnownSize(self._size, self.SIZE_WEIGHT * min(self._sized, self.REMEMBERED))
             steps = 8 if np.abs(moved).max() < 0.1 else 20
-            result = refine(guesses[best], evidence, self._firm, steps, size, systems[best])
+            result = refine(guesses[best], evidence, self._firm, steps, (size,), systems[best])
             if not cut:
                 result = self._with_limbs_checked(result, hull, surface, evidence, size)
             judged = result.system.cost - size.cost(result.state.shape)
-            final = refine(result.state, evidence, self._weights, self.FINAL_STEPS, size)
+            inertia = Inertia(self._expected_joints(self._last, moved), self.INERTIA, self.INERTIA_WIDTH_M)
+            final = refine(result.state, evidence, self._weights, self.FINAL_STEPS, (size, inertia))
             self._remember(final.state.shape)
             fit = Fit(final.state, final.system, judged=judged)
         if fit is None or self._doubts(fit.judged, cut):
@@ -144,6 +150,7 @@ class Tracker:
             self._vain = scratch is None or (fit is not None and scratch.verdict >= fit.verdict - 0.05 * fit.judged)
             if scratch is not None and not self._vain:
                 fit, self._wait = scratch, self.PATIENCE if cut or scratch.judged < self.DOUBTFUL_COST else 1
+                before = None  # how the figure has turned until now was wrong
                 self._size, self._sized = scratch.state.shape, 1
             else:
                 self._wait = min(2 * self._wait, self.LONGEST_WAIT)
@@ -153,7 +160,7 @@ class Tracker:
         # the usual cost follows slowly, so one odd frame is judged by the calm ones before it
         fresh = self._last is None or self._usual_cost == 0.0
         self._usual_cost = fit.judged if fresh else 0.9 * self._usual_cost + 0.1 * fit.judged
-        self._before, self._last = self._last, fit.state
+        self._before, self._last = before, fit.state
         return fit
 
     def _guesses(self, last: FigureState, moved: Array) -> list[FigureState]:
@@ -166,6 +173,13 @@ class Tracker:
             rotations[SWINGING] = _orthonormal(last.rotations[SWINGING] @ turn)
             guesses.append(FigureState(root, rotations, last.shape))
         return guesses
+
+    def _expected_joints(self, last: FigureState, moved: Array) -> Array:
+        """[25, 3] where the joints should be now, m."""
+        joints = figure.place(last).joints
+        if self._before is None:
+            return joints + moved
+        return joints + self.PACE * (joints - figure.place(self._before).joints)
 
     def _remember(self, shape: Array) -> None:
         """The mean shape of the last frames."""
@@ -187,7 +201,7 @@ class Tracker:
         hasty = result.system.cost > bearable
         if hasty:
             if result.stop == "iterations":
-                result = refine(result.state, evidence, self._firm, self.MORE_STEPS, size)
+                result = refine(result.state, evidence, self._firm, self.MORE_STEPS, (size,))
             limbs = LIMBS
         elif self._frame >= self._next_check:
             limbs = LIMBS[self._turn : self._turn + 1]
@@ -219,10 +233,10 @@ class Tracker:
             for state in with_one_limb(result.state, scene, kind, side, self.PLACES, QUICK.candidates):
                 if apart_m(state, result.state) < SAME_PLACE_M:
                     continue
-                settled = refine(state, scene.quick, scene.lenient, 5, size).state
+                settled = refine(state, scene.quick, scene.lenient, 5, (size,)).state
                 if apart_m(settled, result.state) < settled_m:
                     continue
-                other = refine(settled, evidence, self._firm, 8, size)
+                other = refine(settled, evidence, self._firm, 8, (size,))
                 gain = result.system.cost - other.system.cost
                 gain += unseen(result.state, hull) - unseen(other.state, hull)
                 if gain > self.LIMB_GAIN * result.system.cost:
