@@ -12,7 +12,7 @@ from scipy import ndimage
 from limbloc_ros.core import hull as hulls
 from limbloc_ros.core.config import HullConfig
 from limbloc_ros.core.errors import InputError
-from limbloc_ros.core.hull import NOBODY, Hull, carve, largest_component
+from limbloc_ros.core.hull import NOBODY, Hull, carve, components, largest_component
 from limbloc_ros.core.pipeline import Carver
 from limbloc_ros.core.silhouettes import lattice_bounds
 
@@ -165,6 +165,38 @@ def test_largest_component_keeps_a_single_one_and_bridges_small_gaps():
     solid[11:15, 4:8, 4:8] = True  # a gap of one voxel
     two = hull_of(solid)
     assert largest_component(two) is two
+
+
+@pytest.mark.parametrize(
+    ("second", "joined"),
+    [
+        ([[3, 9], [2, 10], [16, 30]], True),  # 4 voxels of 2 cm above
+        ([[14, 22], [2, 10], [16, 30]], True),  # and aside, but within 10 cm
+        ([[3, 9], [2, 10], [20, 30]], False),  # 16 cm above
+        ([[18, 26], [2, 10], [16, 30]], False),
+        ([[14, 22], [2, 10], [2, 16]], False),  # beside it, 8 cm away: somebody else
+        ([[4, 6], [4, 6], [16, 18]], False),  # too small
+    ],
+)
+def test_a_body_that_masks_cut_in_two_is_one_part(second, joined):
+    solid = np.zeros((30, 14, 34), bool)
+    solid[2:10, 2:10, 2:12] = True
+    (a, b), (c, d), (e, f) = second
+    solid[a:b, c:d, e:f] = True
+    for mirror in (slice(None), slice(None, None, -1)):  # which of them is found first does not matter
+        both = hull_of(solid[:, :, mirror], 0.02, 0.06)
+        pieces = components(both)
+        assert len(pieces) == (1 if joined else 2)
+        assert largest_component(both).inside_count == max(piece.inside_count for piece in pieces)
+        assert sum(piece.inside_count for piece in pieces) == both.inside_count
+
+
+def test_three_pieces_of_one_body_are_one_part():
+    solid = np.zeros((30, 14, 44), bool)
+    for low in (2, 15, 28):
+        solid[2:10, 2:10, low : low + 10] = True
+    solid[20:28, 2:10, 2:40] = True  # and somebody else
+    assert [piece.inside_count for piece in components(hull_of(solid, 0.02, 0.06))] == [8 * 8 * 38, 3 * 8 * 8 * 10]
 
 
 def test_lattice_bounds_hold_the_centres_in_the_volume():

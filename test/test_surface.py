@@ -122,14 +122,24 @@ def test_neighbours_are_mutual_and_one_voxel_away():
     assert len(pairs) == (distance == 1).sum()
 
 
-def test_largest_component_wins_over_specks_and_cavities():
+def test_the_surface_has_neither_specks_nor_the_walls_of_cavities():
     def distance(p):
         hollow = np.maximum(sphere(CENTRE, 0.2)(p), -sphere(CENTRE, 0.1)(p))
-        return np.minimum(hollow, sphere(CENTRE + np.array([0.4, 0, 0]), 0.05)(p))
+        return np.minimum(hollow, sphere(CENTRE + np.array([0.4, 0, 0]), 0.03)(p))
 
     surface = extract_surface(hull_of(distance, CENTRE - 0.3, CENTRE + 0.5))
     assert np.abs(np.linalg.norm(surface.points - CENTRE, axis=1) - 0.2).max() < 0.1 * VOXEL
     assert surface.neighbours.max() < len(surface)
+
+
+def test_a_body_that_masks_cut_in_two_has_the_surface_of_both_pieces():
+    up = np.array([0.0, 0.0, 1.0])
+    pieces = capsule(CENTRE - 0.3 * up, CENTRE - 0.08 * up, 0.06), sphere(CENTRE + 0.08 * up, 0.08)
+    surface = extract_surface(hull_of(lambda p: np.minimum(*(d(p) for d in pieces)), CENTRE - 0.4, CENTRE + 0.4))
+    for distance in pieces:
+        alone = extract_surface(hull_of(distance, CENTRE - 0.4, CENTRE + 0.4))
+        kept = {tuple(index) for index in surface.indices}
+        assert sum(tuple(index) in kept for index in alone.indices) > 0.9 * len(alone)
 
 
 def test_thin_sheets_and_hulls_cut_by_the_grid_keep_unit_normals():

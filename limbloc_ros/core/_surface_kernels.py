@@ -72,23 +72,21 @@ def list_neighbours(indices: Ints, offsets: Ints) -> Ints:
 
 
 @njit(cache=True, nogil=True)
-def largest_component(local: Ints, number: Ints, offsets: Ints) -> Ints:
-    """The listed voxels [M, 3] of the largest connected piece, in the same order."""
+def label_pieces(local: Ints, number: Ints, offsets: Ints) -> Ints:
+    """[M] which connected piece each of the listed voxels [M, 3] belongs to, counted from 0 on."""
     nx, ny, nz = number.shape
     label = np.full(len(local), -1, dtype=np.int32)
     stack = np.empty(len(local), dtype=np.int32)
-    labels = best = most = 0
+    labels = 0
     for start in range(len(local)):
         if label[start] >= 0:
             continue
         label[start] = labels
         stack[0] = start
         top = 1
-        size = 0
         while top > 0:
             top -= 1
             n = stack[top]
-            size += 1
             for m in range(len(offsets)):
                 i, j, k = local[n, 0] + offsets[m, 0], local[n, 1] + offsets[m, 1], local[n, 2] + offsets[m, 2]
                 if 0 <= i < nx and 0 <= j < ny and 0 <= k < nz:
@@ -97,10 +95,8 @@ def largest_component(local: Ints, number: Ints, offsets: Ints) -> Ints:
                         label[other] = labels
                         stack[top] = other
                         top += 1
-        if size > most:
-            most, best = size, labels
         labels += 1
-    return local if labels == 1 else local[label == best]
+    return label
 
 
 @njit(cache=True, nogil=True)

@@ -8,6 +8,7 @@ focal length. The largest over the cameras is the hull's signed distance, good t
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -15,6 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from limbloc_ros.core import _block_kernels as near
 from limbloc_ros.core import _component_kernels as apart
@@ -39,6 +41,9 @@ from limbloc_ros.core.views import Views
 DOUBTED_FRACTION = 0.02
 #: A part of the hull is a phantom when in all cameras but one less of what it covers is covered by it alone.
 PHANTOM_SHARE = 0.1
+#: Masks may cut a body in two, as where a belt has the wall's colour: one piece stands over the other, no further from
+#: it than this, m (less a voxel of shell on each), and has no less than this share of its volume. (People side by side do not stand over each other.)
+PIECE_GAP_M, PIECE_SHARE = 0.10, 0.1
 #: A carve volume that ends below this height, m, ends at the floor.
 FLOOR_M = 0.5
 #: By so many voxels of the hull its silhouettes are told from other blobs.
@@ -256,7 +261,8 @@ def carve_silhouettes(silhouettes: Silhouettes, rig: Rig, config: HullConfig) ->
 
 
 def largest_component(hull: Hull) -> Hull:
-    """The hull with only its largest connected part and the shell around it; bridges gaps of about two voxels."""
+    """The hull with only its largest connected part and the shell around it; bridges gaps of about two voxels, and
+    the gap in a body that masks have cut in two."""
     parts = _parts(hull)
     return hull if len(parts.sizes) <= 2 else _with_parts(hull, parts, [int(parts.sizes[1:].argmax()) + 1])
 
@@ -285,7 +291,38 @@ class _Parts(NamedTuple):
 
 
 def _parts(hull: Hull) -> _Parts:
-    return _Parts(*apart.label_components(hull.sdf, np.float32(hull.voxel_m)))
+    parts = _Parts(*apart.label_components(hull.sdf, np.float32(hull.voxel_m)))
+    while (pieces := _pieces_of_one_body(parts, hull.voxel_m)) is not None:
+        parts = _parts_joined(parts, *pieces)
+    return parts
+
+
+def _pieces_of_one_body(parts: _Parts, voxel_m: float) -> tuple[int, int] | None:
+    """Two parts of which one stands over the other, if there are such."""
+    large = np.flatnonzero(parts.sizes >= PIECE_SHARE * parts.sizes[1:].max(initial=0))
+    gap = PIECE_GAP_M / voxel_m
+    for upper, lower in itertools.permutations(large[large > 0].tolist(), 2):
+        bottom, top = parts.boxes[upper, 0, 2], parts.boxes[lower, 1, 2]
+        if abs(bottom - top) <= gap:
+            # what lies within the gap of the plane between them is all that can be so near
+            middle = (bottom + top) / 2
+            cut = slice(max(0, math.floor(middle - 1.5 * gap)), math.ceil(middle + 1.5 * gap))
+            above, below = (np.argwhere(parts.labels[:, :, cut] == part) for part in (upper, lower))
+            if np.min(cKDTree(above).query(below)[0]) <= gap:
+                return upper, lower
+    return None
+
+
+def _parts_joined(parts: _Parts, a: int, b: int) -> _Parts:
+    """The parts, with two of them as one."""
+    kept, gone = min(a, b), max(a, b)
+    numbers = np.arange(len(parts.sizes), dtype=parts.labels.dtype)
+    numbers[gone] = kept
+    numbers[gone + 1 :] -= 1
+    sizes, boxes = parts.sizes.copy(), parts.boxes.copy()
+    sizes[kept] += sizes[gone]
+    boxes[kept] = np.minimum(boxes[a][0], boxes[b][0]), np.maximum(boxes[a][1], boxes[b][1])
+    return _Parts(numbers[parts.labels], np.delete(sizes, gone), np.delete(boxes, gone, axis=0))
 
 
 def _people_among(hull: Hull, hull_parts: _Parts, silhouettes: Silhouettes, config: HullConfig) -> list[int]:

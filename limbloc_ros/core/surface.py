@@ -19,11 +19,14 @@ Array = NDArray[np.float64]
 #: A surface voxel is inside with an outside face neighbour, so along any direction that leaves the hull the surface
 #: is at most a voxel diagonal away.
 REACH_VOXELS = 2.0
+#: A piece of the surface with a smaller share of the largest one's voxels than this is a speck. (What ragged masks
+#: leave beside people has 1 % at most; a belt that masks take for the wall leaves two pieces of nearly the same size.)
+PIECE_SHARE = 0.03
 
 
 @dataclass(frozen=True)
 class Surface:
-    """The outer surface of a hull, one point per surface voxel (largest component only).
+    """The outer surface of a hull, one point per surface voxel, but for specks beside it.
 
     Attributes:
         voxel_m: edge length of a voxel, m.
@@ -71,7 +74,9 @@ def extract_surface(hull: Hull, *, volume: Literal["sdf", "occupancy"] = "sdf") 
     local, number = kernels.list_surface(sdf)
     if len(local) == 0:
         raise InputError("expected a hull with voxels inside (sdf < 0), got an empty one; check the masks and the rig")
-    local = kernels.largest_component(local, number, kernels.OFFSETS)  # no specks, no inner walls of cavities
+    piece = kernels.label_pieces(local, number, kernels.OFFSETS)
+    if piece.any():
+        local = local[np.isin(piece, _outer_pieces(sdf, local, piece))]
 
     filtered = sdf if volume == "sdf" else (sdf >= 0).astype(np.float32)
     normals = kernels.normalise_outward(kernels.sobel_at(filtered, local), sdf, local)
@@ -83,6 +88,17 @@ def extract_surface(hull: Hull, *, volume: Literal["sdf", "occupancy"] = "sdf") 
         points=(indices + 0.5 + steps[:, None] * normals) * hull.voxel_m,
         normals=normals,
     )
+
+
+def _outer_pieces(sdf: NDArray[np.float32], local: NDArray[np.int32], piece: NDArray[np.int32]) -> NDArray[np.int64]:
+    """The pieces of a surface that matter: no specks, no inner walls of cavities."""
+    sizes = np.bincount(piece)
+    large = np.flatnonzero(sizes >= PIECE_SHARE * sizes.max())
+    normals = kernels.normalise_outward(kernels.sobel_at(sdf, local), sdf, local)
+    # of a closed surface the flux of the position through it is three times the volume that it holds
+    middles = np.stack([np.bincount(piece, weights=axis) / sizes for axis in local.T], axis=1)
+    flux = np.bincount(piece, weights=((local - middles[piece]) * normals).sum(axis=1))
+    return np.asarray(large[(flux[large] > 0) | (large == sizes.argmax())], np.int64)
 
 
 def curvature_variability(surface: Surface, radius_m: float) -> tuple[Array, Array]:
