@@ -42,7 +42,8 @@ DOUBTED_FRACTION = 0.02
 #: A part of the hull is a phantom when in all cameras but one less of what it covers is covered by it alone.
 PHANTOM_SHARE = 0.1
 #: Masks may cut a body in two, as where a belt has the wall's colour: one piece stands over the other, no further from
-#: it than this, m (less a voxel of shell on each), and has no less than this share of its volume. (People side by side do not stand over each other.)
+#: it than this, m (less a voxel of shell on each), and has no less than this share of its volume. People side by side
+#: do not stand over each other.
 PIECE_GAP_M, PIECE_SHARE = 0.10, 0.1
 #: A carve volume that ends below this height, m, ends at the floor.
 FLOOR_M = 0.5
