@@ -33,7 +33,7 @@ from score import LIMB13  # noqa: E402
 from tqdm import tqdm  # noqa: E402
 
 from limbloc_ros.core import engine_paper, engine_robust  # noqa: E402
-from limbloc_ros.core.confidence import likely_wrong  # noqa: E402
+from limbloc_ros.core.confidence import Judge  # noqa: E402
 from limbloc_ros.core.config import HullConfig  # noqa: E402
 from limbloc_ros.core.energy import Weights  # noqa: E402
 from limbloc_ros.core.engine_robust import QUICK, SEARCHES, Effort  # noqa: E402
@@ -88,10 +88,8 @@ def searched(*searches: Effort, doubting: bool = False) -> Callable[[Hull], Figu
     def fit(hull: Hull) -> FigureState | None:
         surface = extract_surface(hull)
 
-        def doubtful(state: FigureState) -> bool:
-            return doubting and likely_wrong(state, hull, surface)
-
-        found = engine_robust.fit_from_scratch(hull, surface, 0, None, searches, doubtful)
+        risk_of = Judge(hull, surface).risk_worth_a_search if doubting else None
+        found = engine_robust.fit_from_scratch(hull, surface, 0, None, searches, risk_of)
         return None if found is None else found.state
 
     return fit

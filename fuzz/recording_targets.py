@@ -13,7 +13,7 @@ import numpy as np
 
 from fuzz.inputs import SPLIT, mutate_bytes, mutate_npz, mutate_text, packed_npz, split
 from fuzz.targets import file, folder, rig_seeds, target
-from limbloc_ros.core.confidence import describe_pose
+from limbloc_ros.core.confidence import Judge, describe_pose
 from limbloc_ros.core.errors import LimblocError, NoPerson
 from limbloc_ros.core.figure import FigureState
 from limbloc_ros.core.hull import Hull
@@ -65,7 +65,7 @@ def _saved_run() -> dict[str, bytes]:
     hull = Hull(0.1, (-2, -2, 0), np.full((4, 4, 17), -0.05, np.float32), 0.2)
     frames = [FrameResult(0, NoPerson("nobody"), {"mask": 1.0})]
     for k in (1, 2):
-        pose = describe_pose(FigureState.standing(np.array([0.1 * k, 0, 0.9])), hull, None, {"search": 2.0})
+        pose = describe_pose(FigureState.standing(np.array([0.1 * k, 0, 0.9])), Judge(hull), None, {"search": 2.0})
         frames.append(FrameResult(40_000_000 * k, pose))
     about = {"input": "walk", "kind": "bag", "config": dataclasses.asdict(OfflineConfig()), "version": "1"}
     inside = folder() / "saved"

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from limbloc_ros.core import confidence
-from limbloc_ros.core.confidence import DOUBTFUL, SURE, WARY_FRAMES, Wariness, likely_wrong, risk_of
+from limbloc_ros.core.confidence import DOUBTFUL, SURE, WARY_FRAMES, Judge, Wariness, risk_of
+from limbloc_ros.core.engine_robust import WORTH_A_SEARCH
 from limbloc_ros.core.figure import FigureState, place
 from limbloc_ros.core.hull import Hull
 from limbloc_ros.core.pose import Pose
@@ -92,16 +93,20 @@ def test_what_is_worth_another_search(monkeypatch):
     hull, state = block(), FigureState.standing(np.array([0.0, 0.0, 0.95]))
     monkeypatch.setattr(confidence, "xor_energy", lambda hull, placed: 0.3)
     said = [SHOWN, 0.04]
-    monkeypatch.setattr(confidence, "_silhouettes_say", lambda hull, surface, flesh, others: tuple(said))
-    assert not likely_wrong(state, hull, None)
+    monkeypatch.setattr(Judge, "_say", lambda self, flesh: tuple(said))
+
+    def worth_a_search(hull):
+        return Judge(hull).risk_worth_a_search(state) >= WORTH_A_SEARCH
+
+    assert not worth_a_search(hull)
     said[1] = 0.19  # an outline passes the figure by 19 cm
-    assert likely_wrong(state, hull, None)
+    assert worth_a_search(hull)
     said[:] = SHOWN * [[1.0, 1.0, 1.0], [0.05, 0.05, 1.0]], 0.04
-    assert likely_wrong(state, hull, None)
+    assert worth_a_search(hull)
     # half a person is doubted, but nobody would find a better figure of that hull
     cut = hull.sdf.copy()
     cut[-2, 3:-3, 3:-3] = -0.05
-    assert not likely_wrong(state, dataclasses.replace(hull, sdf=cut), None)
+    assert not worth_a_search(dataclasses.replace(hull, sdf=cut))
 
 
 def test_a_followed_figure_that_was_doubted_must_be_clearly_right_for_some_frames():

@@ -139,20 +139,35 @@ def test_a_doubtful_figure_is_searched_for_once_more():
     second = replace(first, torsos=2, starts=2)
     asked = []
 
-    def fit(doubtful):
-        return fit_from_scratch(hull, surface, 0, None, (first, second), doubtful)
+    def fit(risk_of):
+        return fit_from_scratch(hull, surface, 0, None, (first, second), risk_of)
 
-    once = fit(lambda state: bool(asked.append(state)))
+    def risky(state):
+        asked.append(state)
+        return engine_robust.WORTH_A_SEARCH
+
+    once = fit(lambda state: 0.9 * risky(state))
     assert len(asked) == 1
     assert asked[0] is once.state
     np.testing.assert_array_equal(once.state.rotations, fit(None).state.rotations)
     asked.clear()
-    fit(lambda state: not asked.append(state))
+    fit(risky)
     assert len(asked) == 1  # nobody is asked after the last search
-    thrice = fit_from_scratch(hull, surface, 0, None, (first, first, second), lambda state: not asked.append(state))
+    thrice = fit_from_scratch(hull, surface, 0, None, (first, first, second), risky)
     alone = fit_from_scratch(hull, surface, 0, None, (second,))
     assert len(asked) == 3
     assert thrice.verdict == min(once.verdict, alone.verdict)
+
+
+@pytest.mark.parametrize(("likely", "risk", "tried"), [(1.0, 0.5, False), (1.0, 1.5, True), (0.0, 0.5, True)])
+def test_limbs_of_a_figure_that_is_hardly_wrong_stay_where_they_are(monkeypatch, likely, risk, tried):
+    trials = []
+    monkeypatch.setattr(engine_robust, "_with_better_limb", lambda winner, *_: trials.append(winner) or winner)
+    name, frame = PEOPLE[0]
+    hull = hull_of(name, frame)
+    effort = replace(engine_robust.QUICK, torsos=1, leg_pairs=1, starts=1, certain=1e-9, likely=likely, enough=1.0)
+    fit_from_scratch(hull, extract_surface(hull), 0, None, (effort,), lambda state: risk * engine_robust.CALM)
+    assert bool(trials) == tried
 
 
 def test_evidence_is_a_fair_sample():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from limbloc_ros.core._figure_kernels import exp_so3
-from limbloc_ros.core.confidence import describe_pose
+from limbloc_ros.core.confidence import Judge, describe_pose
 from limbloc_ros.core.figure import BONE, FigureState
 from limbloc_ros.core.pipeline import Carver, PoseEstimator
 from limbloc_ros.core.search import turned_about
@@ -30,7 +30,7 @@ def walking():
 
 def described(state, walking):
     hull, surface, _ = walking
-    return describe_pose(state, hull, None, {}, surface=surface)
+    return describe_pose(state, Judge(hull, surface), None, {})
 
 
 def arm_in_the_trunk(pose, side):
@@ -87,4 +87,4 @@ def test_a_figure_that_looks_the_other_way_is_not_reliable(walking):
 def test_where_nobody_knows_what_the_cameras_saw_limbs_are_not_asked(walking):
     hull, surface, pose = walking
     unknown = dataclasses.replace(hull, views=None)
-    assert describe_pose(arm_in_the_trunk(pose, LEFT), unknown, None, {}, surface=surface).risk == 0.0
+    assert describe_pose(arm_in_the_trunk(pose, LEFT), Judge(unknown, surface), None, {}).risk == 0.0

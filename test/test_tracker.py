@@ -199,8 +199,7 @@ class Stand:
         monkeypatch.setattr(Tracker, "_check_limbs", self.check)
         monkeypatch.setattr(tracker.energy, "system", self.system)
 
-    def search(self, hull, surface, seed, weights, searches, doubtful):
-        self.doubtful = doubtful
+    def search(self, hull, surface, seed, weights, searches, risk_of):
         self.searched.append((self.frame, seed, weights, searches))
         if self.scratch_cost is None:
             return None

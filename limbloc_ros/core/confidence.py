@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,9 +42,6 @@ NO_MATCH_COST = 2.8e-4
 #: By logistic regression from 670 frames of other people, poses and cameras than the public suites have, noisy masks,
 #: loose clothes and simulated rooms among them; rounded, for what they are fitted to goes on changing.
 DOUBTFUL = 0.10
-#: Before it comes to that, a figure that is as likely wrong as this is searched for once more, and harder. (When this
-#: was chosen, 8 of 426 that the quick search took for right were wrong; 7 of these had such a risk, and no right one.)
-WORTH_A_SEARCH = 0.05
 #: What was wrong a moment ago mostly still is: for so many frames after a followed figure was doubted, only one that is
 #: that unlikely wrong is to be acted on. (Of 120 figures with a forearm in a box that was carried, 16 were called
 #: reliable, now none; of 120 right ones all are, as before.)
@@ -116,24 +113,55 @@ def risk_of(hull: Hull, flesh: Flesh, energy: float, shown: Array | None, passed
     return risk, max(signs, key=signs.__getitem__)
 
 
-def likely_wrong(state: FigureState, hull: Hull, surface: Surface, others: Sequence[Flesh] = ()) -> bool:
-    """Whether a figure is worth another search; arguments as in `describe_pose`."""
-    if hull.cut_area_m2 >= CUT_M2:
-        return False  # nobody would find a better one
-    placed = figure.place(state)
-    flesh = placed.flesh()
-    risk, _ = risk_of(hull, flesh, xor_energy(hull, placed), *_silhouettes_say(hull, surface, flesh, others))
-    return risk >= WORTH_A_SEARCH
+@dataclass(frozen=True)
+class Judgement:
+    """What hull and silhouettes say of a figure.
+
+    Attributes:
+        placed, flesh: the figure.
+        energy: its XOR energy.
+        risk, sign: of `risk_of`.
+    """
+
+    placed: figure.Placed
+    flesh: Flesh
+    energy: float
+    risk: float
+    sign: str
 
 
-def _silhouettes_say(
-    hull: Hull, surface: Surface | None, flesh: Flesh, others: Sequence[Flesh]
-) -> tuple[Array | None, float]:
-    """How much the limbs show, if that is known, and how far outlines pass the figure, m."""
-    if surface is None:
-        return None, 0.0
-    shown = None if hull.views is None else limbs_shown(hull.views, flesh)
-    return shown, unexplained_m(hull, surface, flesh, others)
+class Judge:
+    """Tells how likely figures of one hull are wrong.
+
+    Args:
+        hull: what they are fitted to.
+        surface: the hull's; without it the silhouettes are not asked.
+        others: where other people are; what they explain of the outlines, a figure need not.
+    """
+
+    def __init__(self, hull: Hull, surface: Surface | None = None, others: Sequence[Flesh] = ()) -> None:
+        self.hull, self._surface, self._others = hull, surface, others
+        self._last: tuple[FigureState, Judgement] | None = None  # who is asked while searching is published mostly
+
+    def judge(self, state: FigureState) -> Judgement:
+        """What is known of a figure."""
+        if self._last is None or self._last[0] is not state:
+            placed = figure.place(state)
+            flesh = placed.flesh()
+            energy = xor_energy(self.hull, placed)
+            self._last = state, Judgement(placed, flesh, energy, *risk_of(self.hull, flesh, energy, *self._say(flesh)))
+        return self._last[1]
+
+    def risk_worth_a_search(self, state: FigureState) -> float:
+        """How likely a figure is wrong although there may be a better one; 0 where nobody would find one."""
+        return 0.0 if self.hull.cut_area_m2 >= CUT_M2 else self.judge(state).risk
+
+    def _say(self, flesh: Flesh) -> tuple[Array | None, float]:
+        """How much the limbs show, if that is known, and how far outlines pass the figure, m."""
+        if self._surface is None:
+            return None, 0.0
+        shown = None if self.hull.views is None else limbs_shown(self.hull.views, flesh)
+        return shown, unexplained_m(self.hull, self._surface, flesh, self._others)
 
 
 class Wariness:
@@ -154,45 +182,33 @@ class Wariness:
 
 
 def describe_pose(
-    state: FigureState,
-    hull: Hull,
-    system: System | None,
-    stage_ms: Mapping[str, float],
-    rivals: Rivals = (),
-    surface: Surface | None = None,
-    others: Sequence[Flesh] = (),
+    state: FigureState, judge: Judge, system: System | None, stage_ms: Mapping[str, float], rivals: Rivals = ()
 ) -> Pose:
     """Everything that is published about a fitted figure.
 
     Args:
         state: the figure.
-        hull: what it was fitted to.
+        judge: of the hull that it was fitted to.
         system: the smooth energy around the fit, if the engine has one.
         stage_ms: process time of the stages so far, ms.
         rivals: figures that explain the hull nearly as well, with their energy over the least.
-        surface: the hull's; without it the silhouettes are not asked whether the pose is reliable.
-        others: where other people are; what they explain of the outlines, this figure need not.
     """
-    placed = figure.place(state)
-    flesh = placed.flesh()
-    energy = xor_energy(hull, placed)
+    known = judge.judge(state)
+    joints, risk, sign = known.placed.joints, known.risk, known.sign
     sigma = joint_sigma(state, system, rivals) if system is not None else np.full(len(JOINT_NAMES), 0.05)
-    sizes = {
-        f"{a}-{b}": float(np.linalg.norm(placed.joints[JOINT[a]] - placed.joints[JOINT[b]])) for a, b in STICK_BONES
-    }
+    sizes = {f"{a}-{b}": float(np.linalg.norm(joints[JOINT[a]] - joints[JOINT[b]])) for a, b in STICK_BONES}
     sizes["stature"] = float(np.exp(state.shape[0]))
-    risk, sign = risk_of(hull, flesh, energy, *_silhouettes_say(hull, surface, flesh, others))
     if risk == 0.0 and system is not None and system.cost >= NO_MATCH_COST:
         risk, sign = 1.0, "the figure does not match the hull's surface, and what the cameras saw is not known"
     return Pose(
-        joints=placed.joints,
-        rotations=placed.rotations,
+        joints=joints,
+        rotations=known.placed.rotations,
         bone_names=figure.BONE_NAMES,
-        angles=native_angles(placed.rotations, shape=state.shape),
+        angles=native_angles(known.placed.rotations, shape=state.shape),
         sizes=sizes,
-        flesh=flesh,
+        flesh=known.flesh,
         parameters=state.to_vector(),
-        energy=energy,
+        energy=known.energy,
         sigma=sigma,
         reliable=risk < DOUBTFUL,
         stage_ms=dict(stage_ms),

@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 
 from limbloc_ros.core import engine_paper, engine_robust
 from limbloc_ros.core.camera import Camera, Rig
-from limbloc_ros.core.confidence import Wariness, describe_pose, likely_wrong
+from limbloc_ros.core.confidence import Judge, Wariness, describe_pose
 from limbloc_ros.core.config import FitConfig, HullConfig, validated
 from limbloc_ros.core.errors import NoPerson
-from limbloc_ros.core.figure import FigureState
 from limbloc_ros.core.hull import Hull, carve_silhouettes, largest_component
 from limbloc_ros.core.pose import Flesh, Pose
 from limbloc_ros.core.silhouettes import measure_silhouettes, pack_cameras
@@ -85,23 +84,22 @@ class PoseEstimator:
             clock.lap("fit")
             if isinstance(found, NoPerson):
                 return found
-            return describe_pose(found[0].state, hull, None, clock.stage_ms)
+            return describe_pose(found[0].state, Judge(hull), None, clock.stage_ms)
         if hull.views is not None and others:
             hull = dataclasses.replace(hull, views=hull.views.without(others))
         surface = extract_surface(hull)
         clock.lap("surface")
 
-        def doubtful(state: FigureState) -> bool:
-            return likely_wrong(state, hull, surface, others)
-
+        judge = Judge(hull, surface, others)
         if self.config.temporal:
-            fit = self._tracker.follow(hull, surface, doubtful)
+            fit = self._tracker.follow(hull, surface, judge.risk_worth_a_search)
         else:
-            fit = engine_robust.fit_from_scratch(hull, surface, self.config.seed, doubtful=doubtful)
+            risk_of = judge.risk_worth_a_search
+            fit = engine_robust.fit_from_scratch(hull, surface, self.config.seed, risk_of=risk_of)
         clock.lap("fit")
         if fit is None:
             return NoPerson("the hull holds nothing that a torso fits into")
-        pose = describe_pose(fit.state, hull, fit.system, clock.stage_ms, fit.rivals, surface, others)
+        pose = describe_pose(fit.state, judge, fit.system, clock.stage_ms, fit.rivals)
         return self._wariness.judge(pose) if self.config.temporal else pose
 
     def reset(self) -> None:

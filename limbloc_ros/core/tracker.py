@@ -16,9 +16,9 @@ from limbloc_ros.core.engine_robust import (
     QUICK,
     SAME_PLACE_M,
     SETTLED_M,
-    Doubtful,
     Effort,
     Fit,
+    RiskOf,
     apart_m,
     firm,
     fit_from_scratch,
@@ -106,12 +106,12 @@ class Tracker:
         self._centre = np.zeros(3)
         self._size, self._sized = np.zeros(0), 0
 
-    def follow(self, hull: Hull, surface: Surface, doubtful: Doubtful | None = None) -> Fit | None:
+    def follow(self, hull: Hull, surface: Surface, risk_of: RiskOf | None = None) -> Fit | None:
         """Fit the next frame.
 
         Args:
             hull, surface: of one person.
-            doubtful: of `fit_from_scratch`.
+            risk_of: of `fit_from_scratch`.
 
         Returns:
             the fit, or None when there is no figure yet and no torso fits into the hull.
@@ -146,7 +146,7 @@ class Tracker:
                 searches = searches[:1]
             elif fit is not None:  # what the quick search missed is searched harder the next time
                 searches = searches[:2]
-            scratch = fit_from_scratch(hull, surface, self._seed, self._weights, searches, doubtful)
+            scratch = fit_from_scratch(hull, surface, self._seed, self._weights, searches, risk_of)
             self._vain = scratch is None or (fit is not None and scratch.verdict >= fit.verdict - 0.05 * fit.judged)
             if scratch is not None and not self._vain:
                 fit, self._wait = scratch, self.PATIENCE if cut or scratch.judged < self.DOUBTFUL_COST else 1
