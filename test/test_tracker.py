@@ -298,7 +298,7 @@ def test_a_doubted_fit_is_searched_anew_but_not_in_every_frame(stand, first, cos
     stand.costs = dict.fromkeys(range(first, 99), cost)
     follower = Tracker(seed=0)
     stand.run(follower, first - 1)
-    stand.scratch_cost = 0.96 * cost  # hardly better: the figure that was followed stays
+    stand.scratch_cost = (1.01 - Tracker.BETTER) * cost  # hardly better: the figure that was followed stays
     assert stand.run(follower, 29 - first) == [cost] * (29 - first)
     assert stand.search_frames == searched
 
@@ -307,8 +307,8 @@ def test_a_clearly_better_fit_replaces_the_followed_one(stand):
     stand.costs = dict.fromkeys(range(9, 12), 6e-4)
     follower = Tracker(seed=0)
     stand.run(follower, 8)
-    stand.scratch_cost = 0.94 * 6e-4
-    assert stand.run(follower, 1) == [pytest.approx(0.94 * 6e-4)]
+    stand.scratch_cost = (0.99 - Tracker.BETTER) * 6e-4
+    assert stand.run(follower, 1) == [stand.scratch_cost]
     assert stand.search_frames == [1, 9]
 
 

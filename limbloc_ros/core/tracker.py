@@ -54,6 +54,10 @@ class Tracker:
     #: live room a slow fit makes the next step longer. Each time that starting anew finds nothing better, the wait
     #: doubles, up to this: some hulls are just bad. Only after a hopeless start the next frame is tried.
     PATIENCE, LONGEST_WAIT = 8, 32
+    #: By how much of the followed figure's energy the one found anew must be better, or it does not replace it: where
+    #: several figures explain a ragged hull nearly equally well, each search ends with another one. (Turned figures and
+    #: figures with exchanged limbs are replaced in the frame in which they are searched for, with twice this as well.)
+    BETTER = 0.15
     #: A hull that the walls of the carve volume cut by so much, m^2 (an arm is a hundredth), is half a person in the
     #: doorway: not worth more than a quick search, until it is whole.
     HALF_M2 = 0.10
@@ -147,7 +151,9 @@ class Tracker:
             elif fit is not None:  # what the quick search missed is searched harder the next time
                 searches = searches[:2]
             scratch = fit_from_scratch(hull, surface, self._seed, self._weights, searches, risk_of)
-            self._vain = scratch is None or (fit is not None and scratch.verdict >= fit.verdict - 0.05 * fit.judged)
+            self._vain = scratch is None or (
+                fit is not None and scratch.verdict >= fit.verdict - self.BETTER * fit.judged
+            )
             if scratch is not None and not self._vain:
                 fit, self._wait = scratch, self.PATIENCE if cut or scratch.judged < self.DOUBTFUL_COST else 1
                 before = None  # how the figure has turned until now was wrong
