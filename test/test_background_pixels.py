@@ -7,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from limbloc_ros.core import _background_kernels as kernels
+from limbloc_ros.core._background_estimate_kernels import densest_mean
 from limbloc_ros.core._bit_kernels import at_least, no_pixels, spread
 
 
@@ -99,7 +100,7 @@ class TestKernels:
         sharpness = rng.integers(100, 2000, (3, *shape), dtype=np.uint16)
         return image, level, sharpness, np.ones(3, dtype=np.float32)
 
-    def test_only_spans_are_measured_in_whole_words(self):
+    def test_only_spans_are_measured_in_whole_vectors(self):
         frame = *self.frame((20, 700)), np.float32(0.5), np.float32(1.1)
         everywhere = np.tile(np.array([0, 700], dtype=np.int32), (20, 1))
         whole = np.zeros((2, 20, 700), dtype=np.uint8)
@@ -109,7 +110,7 @@ class TestKernels:
         part = np.zeros((2, 12, 636), dtype=np.uint8)  # of the image from row 5 and column 64 on
         kernels.measure(*frame, 5, 64, spans, *part)
         inside = np.zeros((12, 700), dtype=bool)
-        inside[2:5, 64:448] = inside[5:7, 640:] = True
+        inside[2:5, 64:432] = inside[5:7, 640:] = True
         np.testing.assert_array_equal(part, np.where(inside, whole[:, 5:17], 0)[:, :, 64:])
 
     def test_looking_tells_the_pixels_that_are_far(self):
@@ -166,8 +167,10 @@ class TestKernels:
         new_mean = np.where(may, mean + 0.1 * off, mean)
         new_variance = np.where(may, 0.9 * (variance + 0.1 * off**2), variance)
         f = np.float32
+        samples = kernels.sampled(level, 2)
         kernels.learn(
-            image, mean, variance, level, sharpness, gain, packed(busy), packed(changed), f(0.1), f(4), f(1), 1, 2, 2, 3
+            image, mean, variance, level, sharpness, samples, 2, gain, packed(busy), packed(changed),
+            f(0.1), f(4), f(1), 1, 2, 2, 3,
         )  # fmt: skip
         np.testing.assert_allclose(mean, new_mean, rtol=1e-5, atol=1e-3)
         np.testing.assert_allclose(variance, new_variance, rtol=1e-4, atol=1e-2)
@@ -175,6 +178,8 @@ class TestKernels:
         sigma = np.sqrt(new_variance + 4)[:, 5::6]
         assert np.abs(sharpness[:, 5::6] - kernels.SHARPNESS_SCALE / sigma).max() < 0.6
         assert not level[:, 0::6].any()
+        np.testing.assert_array_equal(samples, level[:, 1::2, 1::2])
+        assert samples.any()
 
     def test_images_are_taken_into_mean_and_variance(self):
         images = np.random.default_rng(4).integers(0, 256, (6, 3, 20, 33), dtype=np.uint8)
@@ -195,7 +200,7 @@ class TestKernels:
         image[:, 10:50, 20:45] = 30  # a fifth of the image, unknown to the model
         level = np.rint(mean * kernels.LEVEL_SCALE).astype(np.uint16)
         image = np.ascontiguousarray(image.transpose(1, 2, 0), dtype=np.uint8)
-        found = kernels.light_gain(image, level, no_pixels(60, 80), np.ones(3, dtype=np.float32), 2)
+        found = kernels.light_gain(image, kernels.sampled(level, 2), no_pixels(60, 80), np.ones(3, dtype=np.float32), 2)
         np.testing.assert_allclose(found, gain, rtol=0.02)
 
     def test_light_gain_leaves_out_who_is_known_to_be_there(self):
@@ -204,7 +209,7 @@ class TestKernels:
         busy = np.zeros((60, 80), dtype=bool)
         busy[:, :50] = True
         image[busy] = 60  # five eighths of the image
-        found = kernels.light_gain(image, level, packed(busy), np.ones(3, dtype=np.float32), 2)
+        found = kernels.light_gain(image, kernels.sampled(level, 2), packed(busy), np.ones(3, dtype=np.float32), 2)
         np.testing.assert_allclose(found, 1, rtol=1e-3)
 
     def test_light_gain_keeps_the_last_one_in_the_dark(self):
@@ -217,7 +222,7 @@ class TestKernels:
         rng = np.random.default_rng(4)
         samples = rng.integers(0, 256, (15, 5, 6, 3), dtype=np.uint8)
         gains = rng.uniform(0.8, 1.2, (15, 3)).astype(np.float32)
-        mean, sigma = kernels.densest_mean(samples, gains, 0.4)
+        mean, sigma = densest_mean(samples, gains, 0.4)
         values = samples / gains[:, None, None]
         for y in range(5):
             for x in range(6):

@@ -61,7 +61,7 @@ def test_most_of_nine_is_the_median(seed, width):
 def test_pixels_beside_others(seed, width):
     mask = random_mask(seed, width, 0.2)
     up, down, left, right = (np.roll(np.pad(mask, 1), by, axis)[1:-1, 1:-1] for axis in (0, 1) for by in (1, -1))
-    np.testing.assert_array_equal(bits.spread(bits.beside(packed(mask)), width), up | down | left | right)
+    np.testing.assert_array_equal(bits.spread(bits.beside(packed(mask), width), width), up | down | left | right)
 
 
 @given(st.integers(0, 1000), st.sampled_from(WIDTHS), st.sampled_from([0, 1, 2, 3, 7, 20, 70]))

@@ -73,7 +73,7 @@ CORE_ORDER = (
 )
 
 #: What each package may import from outside the standard library.
-NUMERIC = {"numpy", "scipy", "cv2", "numba"}
+NUMERIC = {"numpy", "scipy", "cv2", "numba", "llvmlite"}  # the last is numba's own language
 ROS = {
     "rclpy",
     "builtin_interfaces",

@@ -107,6 +107,19 @@ class TestKernels:
         kernels.trim(found, packed(core), change, units)
         np.testing.assert_array_equal(unpacked(found, mask), (mask > 0) & ((core > 0) | enough))
 
+    @pytest.mark.parametrize("shape", [(1, 3), (2, 64), (33, 47), (20, 130)])
+    def test_the_median_of_nine(self, shape):
+        values = np.random.default_rng(shape).integers(0, 256, shape, dtype=np.uint8)
+        np.testing.assert_array_equal(kernels.median_of_nine(values), cv2.medianBlur(values, 3))
+
+    def test_nothing_to_clean_and_to_place(self):
+        nothing = np.zeros((0, 0), dtype=np.uint8)
+        part = clean_mask(nothing, nothing, BackgroundConfig(), 1.0)
+        mask, busy, count = kernels.place(part, 0, 0, np.full(5, 2, dtype=np.int32), 40, 140)
+        assert (mask.shape, busy.shape, count) == ((40, 140), (40, 3), 0)
+        assert not mask.any()
+        assert not busy.any()
+
     def test_body_parts_by_hand(self):
         mask = np.zeros((12, 12), dtype=np.uint8)
         mask[2:10, 2:10] = 255
@@ -139,9 +152,8 @@ class TestKernels:
         expected[:, 0], expected[:, -1] = expected[:, 1], expected[:, -2]
         inside = np.zeros_like(expected)
         inside[top : top + 20, left : left + width] = 255
-        mask, busy = np.zeros_like(expected), bits.no_pixels(40, 140)
         square = np.full(5, 2, dtype=np.int32)
-        count = kernels.place(packed(part), top, left, square, mask, busy)
+        mask, busy, count = kernels.place(packed(part), top, left, square, 40, 140)
         np.testing.assert_array_equal(mask, expected)
         assert count == np.count_nonzero(expected)
         around = cv2.dilate(expected, np.ones((5, 5), np.uint8)) & inside
@@ -229,7 +241,7 @@ class TestCleaning:
 def test_the_warm_up_leaves_no_kernel_to_be_compiled_for_the_first_person(monkeypatch):
     """As it was when nothing in its images was foreground: the first person was not seen for ten seconds."""
     used = set()
-    wanted = {"measure", "foreground", "silhouette", "place", "learn", "light_gain", "look", "foreground_spans"}
+    wanted = {"measure_around", "clean", "place", "learn", "light_gain", "look"}
     for module in (background, background_evidence, kernels):
         for name in wanted & set(vars(module)):
             kernel = getattr(module, name)

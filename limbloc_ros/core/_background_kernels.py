@@ -28,35 +28,30 @@ LEVEL_SCALE = 128.0
 SHARPNESS_SCALE = 4096.0
 """Fixed point of one over sigma: units at a sigma of one grey level (a sigma of 0.1 fits into 16 bits)."""
 
+LANES = 16
+"""So many pixels are measured at a time."""
+
 # The maths holds no NaN (variances are floored), so these flags only let the compiler use vector instructions.
 _VECTOR = {"nnan", "ninf", "nsz", "contract", "reassoc"}
 
 
 @njit(cache=True)
-def split_row(image: Bytes, y: int, left: int, channels: Bytes) -> None:
-    """Put the three channels of a part of a row, which are interleaved in the image, one behind the other.
+def split(values: Bytes, first: int, channels: Bytes) -> None:
+    """Put the three channels of some pixels, which are interleaved in the image, one behind the other.
 
     Args:
-        image: [H, W, 3].
-        y, left: the row, and its first column.
+        values: [3 H W] the image; to be reshaped once, not for every few pixels: numba calls NumPy for it.
+        first: the first of these pixels, counted row by row.
         channels: [3 n] out.
     """
     # Written like this, with one array on each side and no index that might be negative, it becomes some shuffles of
     # vectors: a tenth of the time.
-    pixels = image[y].reshape(-1)[3 * left :]
+    pixels = values[3 * first :]
     n = channels.size // 3
     for x in range(n):
         channels[x] = pixels[3 * x]
         channels[n + x] = pixels[3 * x + 1]
         channels[2 * n + x] = pixels[3 * x + 2]
-
-
-@njit(cache=True, inline="always")
-def _word_of(distance: Floats, x: int, number: int, least: np.float32) -> np.uint64:
-    word = np.uint64(0)
-    for j in range(number):
-        word |= np.uint64(distance[x + j] >= least) << np.uint64(j)
-    return word
 
 
 @njit(cache=True, fastmath=_VECTOR, error_model="numpy")
@@ -73,15 +68,16 @@ def look(
     Returns:
         how many pixels.
     """
-    width = image.shape[1]
+    width, values = image.shape[1], image.reshape(-1)
     top, least = np.float32(255), far * far
     unit = np.float32(1.0 / SHARPNESS_SCALE)
-    distance = np.empty(width, dtype=np.float32)
+    distances = np.empty((1, width), dtype=np.float32)
+    distance = distances[0]
     channels = np.empty(3 * width, dtype=np.uint8)
     total = 0
     for k in range(len(changed)):
         y = first + k * step
-        split_row(image, y, 0, channels)
+        split(values, y * width, channels)
         distance[:] = 0
         for c in range(3):
             pixel, means, sharp = channels[c * width : (c + 1) * width], level[c, y], sharpness[c, y]
@@ -90,20 +86,16 @@ def look(
                 off = (np.float32(pixel[x]) - min(g * np.float32(means[x]), top)) * (np.float32(sharp[x]) * unit)
                 distance[x] += off * off
         for n in range(width // WORD):
-            changed[k, n] = _word_of(distance, WORD * n, WORD, least)
+            changed[k, n] = word_at_least(distances, 0, WORD * n, WORD, least)
         if width % WORD:
-            changed[k, -1] = _word_of(distance, width - width % WORD, width % WORD, least)
+            changed[k, -1] = word_at_least(distances, 0, width - width % WORD, width % WORD, least)
         total += count_in(changed, k, 0, width)
     return total
 
 
-# Loops of a constant length need no code for what is left over behind the last vector: hence the two calls of functions
-# that are inlined.
-
-
-@njit(cache=True, inline="always")
-def _measure_word(
-    image: Bytes,
+@njit(cache=True, fastmath=_VECTOR, error_model="numpy")
+def _measure_run(
+    values: Bytes,
     level: Words,
     sharpness: Words,
     gain: Floats,
@@ -111,36 +103,38 @@ def _measure_word(
     brightest: np.float32,
     y: int,
     begin: int,
-    n: int,
     channels: Bytes,
     sums: Floats,
     change: Bytes,
     colour: Bytes,
 ) -> None:
-    top = np.float32(255)
-    split_row(image, y, begin, channels[: 3 * n])
-    # Sums over the channels live in one array at constant offsets: few pointers, so that the compiler can prove that
-    # the loops may run on vectors. Their rounding (1e-2 sigma squared) is far below any threshold.
-    for x in range(n):
-        sums[x] = np.float32(0)
-        sums[x + WORD] = np.float32(0)
-        sums[x + 2 * WORD] = np.float32(0)
+    """Measure some pixels beside each other.
+
+    Args:
+        values, level, sharpness, gain, darkest, brightest: as in `measure`; of the image [3 H W] as in `split`.
+        y, begin: row and first column.
+        channels, sums: [3 W] and [6 W], to work with.
+        change, colour: [n] out, as in `measure`.
+    """
+    n, top = change.size, np.float32(255)
+    split(values, y * level.shape[2] + begin, channels[: 3 * n])
+    # What the channels give lives in one array: few pointers, so that the compiler can prove that the loops may run on
+    # vectors. Rounding (1e-2 sigma squared) is far below any threshold.
     for c in range(3):
         pixel = channels[c * n : (c + 1) * n]
-        means = level[c, y, begin : begin + n]
-        sharp = sharpness[c, y, begin : begin + n]
+        means, sharp = level[c, y, begin : begin + n], sharpness[c, y, begin : begin + n]
+        expected, off = sums[2 * c * n : (2 * c + 1) * n], sums[(2 * c + 1) * n : (2 * c + 2) * n]
         g = gain[c] * np.float32(1.0 / LEVEL_SCALE)
         for x in range(n):
             per_sigma = np.float32(sharp[x]) * np.float32(1.0 / SHARPNESS_SCALE)
-            expected = min(g * np.float32(means[x]), top) * per_sigma
-            off = np.float32(pixel[x]) * per_sigma - expected
-            sums[x] += off * off
-            sums[x + WORD] += off * expected
-            sums[x + 2 * WORD] += expected * expected
+            expected[x] = min(g * np.float32(means[x]), top) * per_sigma
+            off[x] = np.float32(pixel[x]) * per_sigma - expected[x]
     for x in range(n):
-        far2 = sums[x]
-        along = sums[x + WORD]
-        length2 = sums[x + 2 * WORD] + np.float32(1e-6)
+        e0, e1, e2 = sums[x], sums[x + 2 * n], sums[x + 4 * n]
+        off0, off1, off2 = sums[x + n], sums[x + 3 * n], sums[x + 5 * n]
+        far2 = off0 * off0 + off1 * off1 + off2 * off2
+        along = off0 * e0 + off1 * e1 + off2 * e2
+        length2 = e0 * e0 + e1 * e1 + e2 * e2 + np.float32(1e-6)
         # The nearest point of the line of scaled backgrounds, kept between the darkest and the brightest.
         t = min(max(along / length2, darkest - np.float32(1)), brightest - np.float32(1))
         rest2 = max(far2 - t * (np.float32(2) * along - t * length2), np.float32(0))
@@ -148,7 +142,7 @@ def _measure_word(
         colour[x] = np.uint8(np.int32(min(np.float32(COLOUR_SCALE) * np.sqrt(rest2), top)))
 
 
-@njit(cache=True, fastmath=_VECTOR, error_model="numpy")
+@njit(cache=True)
 def measure(
     image: Bytes,
     level: Words,
@@ -171,25 +165,20 @@ def measure(
         gain: [3] brightness of the light now over that of the model.
         darkest, brightest: shadows and highlights scale the background by a factor in this range.
         top, left: row and column of the frame where `change` and `colour` begin; `left` is a multiple of WORD.
-        spans: [h, 2] of each row the first column of the frame to measure, and the one behind the last. Whole words
-            of pixels are measured.
+        spans: [h, 2] of each row the first column of the frame to measure, and the one behind the last; measured
+            are LANES pixels at a time.
         change: [h, w] out, distance to the background in sigmas * CHANGE_SCALE; w is a multiple of WORD or reaches to
             the end of the frame.
         colour: [h, w] out, what of it no shadow or highlight explains, in sigmas * COLOUR_SCALE.
     """
-    width = image.shape[1]
-    sums, channels = np.empty(3 * WORD, dtype=np.float32), np.empty(3 * WORD, dtype=np.uint8)
+    width, values = image.shape[1], image.reshape(-1)
+    sums, channels = np.empty(6 * width, dtype=np.float32), np.empty(3 * width, dtype=np.uint8)
     for row in range(len(change)):
-        y = top + row
-        for begin in range(spans[row, 0] // WORD * WORD, spans[row, 1], WORD):
-            out, tint = change[row, begin - left :], colour[row, begin - left :]
-            if begin + WORD <= width:
-                _measure_word(
-                    image, level, sharpness, gain, darkest, brightest, y, begin, WORD, channels, sums, out, tint
-                )
-            else:
-                n = width - begin
-                _measure_word(image, level, sharpness, gain, darkest, brightest, y, begin, n, channels, sums, out, tint)
+        begin, end = spans[row, 0] // LANES * LANES, min((spans[row, 1] + LANES - 1) // LANES * LANES, width)
+        if begin >= end:
+            continue
+        out, tint = change[row, begin - left : end - left], colour[row, begin - left : end - left]
+        _measure_run(values, level, sharpness, gain, darkest, brightest, top + row, begin, channels, sums, out, tint)
 
 
 @njit(cache=True, fastmath=_VECTOR, error_model="numpy")
@@ -223,6 +212,8 @@ def learn(
     variance: Floats,
     level: Words,
     sharpness: Words,
+    samples: Words,
+    stride: int,
     gain: Floats,
     busy: Bits,
     changed: Bits,
@@ -239,6 +230,7 @@ def learn(
     Args:
         image, level, sharpness, gain: as in `measure`.
         mean, variance: [3, H, W] grey levels and their square, without the floor.
+        samples, stride: as in `sampled`; they follow the levels.
         busy: [H, N] bits, set where nothing may be learned (foreground and its rim).
         changed, first, step: nor may what is changed in the rows that were looked at, as in `look`.
         rate: weight of the new pixel.
@@ -246,14 +238,14 @@ def learn(
         weight: 1, or 1/3 when the three channels are copies of one.
         turn, turns: of the rows that were looked at those turn, turn + turns, ... are learned.
     """
-    width = image.shape[1]
+    width, values = image.shape[1], image.reshape(-1)
     one, zero = np.float32(1), np.float32(0)
     weights = np.empty(width, dtype=np.float32)
     channels = np.empty(3 * width, dtype=np.uint8)
     flags = np.empty((2, width), dtype=np.uint8)
     for k in range(turn, len(changed), turns):
         y = first + k * step
-        split_row(image, y, 0, channels)
+        split(values, y * width, channels)
         spread_row(busy, y, flags, 0, width)
         spread_row(changed, k, flags, 1, width)
         taken, far = flags[0], flags[1]
@@ -269,6 +261,10 @@ def learn(
                 v[x] = (one - w) * (v[x] + w * off * off)
                 m[x] += w * off
             fix(m, v, floor_variance, weight, level[c, y], sharpness[c, y])
+        if y % stride == stride // 2:
+            for c in range(3):
+                for column in range(samples.shape[2]):
+                    samples[c, y // stride, column] = level[c, y, stride // 2 + column * stride]
 
 
 @njit(cache=True, fastmath=_VECTOR, error_model="numpy")
@@ -291,6 +287,12 @@ def add_to_mean(image: Bytes, gain: Floats, count: int, mean: Floats, squares: F
                 after = m[x] + before * share
                 s[x] += before * (now - after)
                 m[x] = after
+
+
+@njit(cache=True)
+def _pairs(word: np.uint64) -> np.uint64:
+    """The pixels of a word whose right neighbour in it is set as they are."""
+    return word & (word >> np.uint64(1))
 
 
 @njit(cache=True, fastmath=_VECTOR, error_model="numpy")
@@ -321,35 +323,34 @@ def foreground_spans(
         spans: [H, 2] out, first column and the one behind the last, over all foreground of the rows around.
     """
     height, width = image.shape[:2]
-    number = changed.shape[1]
+    values, number = image.reshape(-1), changed.shape[1]
     spans[:, 0] = width
     spans[:, 1] = 0
-    change, colour = np.empty((2, 1, WORD), dtype=np.uint8)
-    sums, channels = np.empty(3 * WORD, dtype=np.float32), np.empty(3 * WORD, dtype=np.uint8)
-    level_of, one = np.uint8(least), np.uint64(1)
+    change, colour = np.empty(width, dtype=np.uint8), np.empty((1, WORD * number), dtype=np.uint8)
+    sums, channels = np.empty(6 * width, dtype=np.float32), np.empty(3 * width, dtype=np.uint8)
+    level_of = np.uint8(least)
     for k in range(len(changed)):
         y = first + k * step
+        before, behind = number, 0  # the words that hold pairs
+        for n in range(number):
+            if _pairs(changed[k, n]):
+                before, behind = min(before, n), n + 1
+        begin, end = WORD * before, min(WORD * behind, width)
+        if begin >= end:
+            continue
+        _measure_run(
+            values, level, sharpness, gain, darkest, brightest, y, begin, channels, sums,
+            change[: end - begin], colour[0, : end - begin],
+        )  # fmt: skip
         left, right = width, 0
-        # The colour is measured word by word, from both ends inwards, until there is a pair that has it.
-        for side in range(2):
-            found = np.uint64(0)
-            for i in range(number):
-                n = i if side == 0 else number - 1 - i
-                word = changed[k, n]
-                if word & (word >> one) == 0:
-                    continue
-                _measure_word(
-                    image, level, sharpness, gain, darkest, brightest, y, WORD * n, min(WORD, width - WORD * n),
-                    channels, sums, change[0], colour[0],
-                )  # fmt: skip
-                word &= word_at_least(colour, 0, 0, WORD, level_of)
-                found = word & (word >> one)
+        for n in range(before, behind):
+            word = changed[k, n]
+            if _pairs(word):
+                word &= word_at_least(colour, 0, WORD * n - begin, WORD, level_of)
+                found = _pairs(word)
                 if found:
                     left = min(left, WORD * n + lowest(found))
-                    right = max(right, WORD * n + highest(found) + 2)
-                    break
-            if found == 0:
-                break
+                    right = WORD * n + highest(found) + 2
         if right == 0:
             continue  # noise, or a shadow
         left, right = max(left - rim, 0), min(right + rim, width)
@@ -373,31 +374,77 @@ def box_of(spans: Spans, pad: int, width: int) -> tuple[int, int, int, int]:
     return max(top - pad, 0), min(bottom + pad, len(spans)), left, right
 
 
+@njit(cache=True)
+def measure_around(
+    image: Bytes,
+    level: Words,
+    sharpness: Words,
+    gain: Floats,
+    darkest: np.float32,
+    brightest: np.float32,
+    changed: Bits,
+    least: int,
+    first: int,
+    step: int,
+    rim: int,
+    pad: int,
+    everywhere: bool,
+) -> tuple[int, int, Bytes, Bytes]:
+    """Measure an image where somebody may be (`foreground_spans`, with its arguments), in one call.
+
+    Args:
+        pad: pixels around everything that is measured to take into the arrays, as 0.
+        everywhere: measure all of it.
+
+    Returns:
+        top and left of the arrays in the image, `change` and `colour` as in `measure`; 0 where nothing was measured.
+    """
+    height, width = image.shape[:2]
+    spans = np.empty((height, 2), dtype=np.int32)
+    if everywhere:
+        spans[:, 0] = 0
+        spans[:, 1] = width
+    else:
+        foreground_spans(image, level, sharpness, gain, darkest, brightest, changed, least, first, step, rim, spans)
+    top, bottom, left, right = box_of(spans, pad, width)
+    change = np.zeros((bottom - top, right - left), dtype=np.uint8)
+    colour = np.zeros_like(change)
+    measure(image, level, sharpness, gain, darkest, brightest, top, left, spans[top:bottom], change, colour)
+    return top, left, change, colour
+
+
+def sampled(level: Words, stride: int) -> Words:
+    """Of levels [3, H, W] those that `light_gain` needs, by themselves: else it mostly waits for memory."""
+    some = slice(stride // 2, None, stride)
+    return np.ascontiguousarray(level[:, some, some])
+
+
 @njit(cache=True, fastmath=_VECTOR, error_model="numpy")
-def light_gain(image: Bytes, level: Words, busy: Bits, last: Floats, stride: int) -> Floats:
+def light_gain(image: Bytes, samples: Words, busy: Bits, last: Floats, stride: int) -> Floats:
     """Brightness of the light per channel relative to the model: a median ratio, then a trimmed ratio of sums.
 
     Looks at every `stride`-th pixel that is not `busy` and whose background is neither dark nor near clipping.
 
     Args:
         image: [H, W, 3].
-        level: [3, H, W] as in `measure`.
+        samples: `sampled` levels of the model.
         busy: [H, N] bits.
 
     Returns:
         [3] the gains; `last` for a channel with too few usable pixels.
     """
-    height, width = image.shape[:2]
     gain = last.copy()
     bins = 1024
-    means = np.empty((height // stride + 1) * (width // stride + 1), dtype=np.float32)
+    means = np.empty(samples[0].size, dtype=np.float32)
     values = np.empty_like(means)
     for c in range(3):
         counts = np.zeros(bins, dtype=np.int32)
         total = 0
-        for y in range(stride // 2, height, stride):
-            for x in range(stride // 2, width, stride):
-                m = np.float32(level[c, y, x]) * np.float32(1.0 / LEVEL_SCALE)
+        for row in range(samples.shape[1]):
+            y = stride // 2 + row * stride
+            for column in range(samples.shape[2]):
+                x = stride // 2 + column * stride
+                m = np.float32(samples[c, row, column]) * np.float32(1.0 / LEVEL_SCALE)
                 v = np.float32(image[y, x, c])
                 means[total], values[total] = m, v
                 free = (busy[y, x // WORD] >> np.uint64(x % WORD)) & np.uint64(1) == 0
@@ -421,52 +468,3 @@ def light_gain(image: Bytes, level: Words, busy: Bits, last: Floats, stride: int
         if bottom > 0:
             gain[c] = min(max(top / bottom, np.float32(0.2)), np.float32(5))
     return gain
-
-
-@njit(cache=True)
-def densest_mean(samples: Bytes, gains: Floats, share: float) -> tuple[Floats, Floats]:
-    """Mean and standard deviation of every pixel's most crowded brightness interval.
-
-    Args:
-        samples: [N, H, W, 3] frames of one camera.
-        gains: [N, 3] light of each frame; samples are divided by it.
-        share: part of the N samples that the interval must hold, 0 < share <= 1.
-
-    Returns:
-        mean [H, W, 3] and sigma [H, W, 3], grey levels.
-    """
-    count, height, width, _ = samples.shape
-    need = min(max(int(np.ceil(share * count)), 1), count)
-    mean = np.empty((height, width, 3), dtype=np.float32)
-    sigma = np.empty((height, width, 3), dtype=np.float32)
-    brightness = np.empty(count, dtype=np.float32)
-    order = np.empty(count, dtype=np.int32)
-    inverse = np.float32(1) / gains
-    for y in range(height):
-        for x in range(width):
-            for k in range(count):
-                value = np.float32(0)
-                for c in range(3):
-                    value += np.float32(samples[k, y, x, c]) * inverse[k, c]
-                at = k
-                while at > 0 and brightness[at - 1] > value:
-                    brightness[at] = brightness[at - 1]
-                    order[at] = order[at - 1]
-                    at -= 1
-                brightness[at] = value
-                order[at] = k
-            best = 0
-            for first in range(1, count - need + 1):
-                if brightness[first + need - 1] - brightness[first] < brightness[best + need - 1] - brightness[best]:
-                    best = first
-            for c in range(3):
-                total = 0.0
-                squares = 0.0
-                for k in range(best, best + need):
-                    value = samples[order[k], y, x, c] * inverse[order[k], c]
-                    total += value
-                    squares += value * value
-                average = total / need
-                mean[y, x, c] = average
-                sigma[y, x, c] = np.sqrt(max(squares / need - average * average, 0.0))
-    return mean, sigma

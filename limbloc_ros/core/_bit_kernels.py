@@ -7,8 +7,13 @@ here knows what a mask shows.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
-from numba import njit
+from llvmlite import ir
+from numba import njit, types
+from numba.core import cgutils
+from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 Bytes = NDArray[np.uint8]
@@ -77,12 +82,48 @@ def count_in(mask: Bits, y: int, start: int, end: int) -> int:
     return total
 
 
-# The loops over the pixels of a word run on vectors when their number is a constant; hence the two calls of each.
+# Between 64 values and their bits there is one instruction, or a few, for which the compiler does not take a loop.
+# Hence these two in its own language; the pixels of a row must lie one behind the other.
+
+
+@intrinsic
+def _whole_word_at_least(typing_context: Any, values: Any, y: Any, x: Any, least: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        kind = ir.VectorType(context.get_value_type(signature.args[0].dtype), WORD)
+        found = builder.load(_pointer(context, builder, signature.args[0], arguments[:3], kind), align=1)
+        first = builder.insert_element(ir.Constant(kind, ir.Undefined), arguments[3], ir.IntType(32)(0))
+        everywhere = ir.Constant(ir.VectorType(ir.IntType(32), WORD), None)
+        level = builder.shuffle_vector(first, first, everywhere)
+        compare = builder.fcmp_ordered if signature.args[3] in types.real_domain else builder.icmp_unsigned
+        return builder.bitcast(compare(">=", found, level), ir.IntType(64))
+
+    return types.uint64(values, types.intp, types.intp, values.dtype), generate
+
+
+@intrinsic
+def _spread_whole_word(typing_context: Any, word: Any, out: Any, y: Any, x: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        kind = ir.VectorType(ir.IntType(8), WORD)
+        flags = builder.bitcast(arguments[0], ir.VectorType(ir.IntType(1), WORD))
+        place = _pointer(context, builder, signature.args[1], arguments[1:], kind)
+        builder.store(builder.sext(flags, kind), place, align=1)
+        return context.get_dummy_value()
+
+    return types.void(types.uint64, out, types.intp, types.intp), generate
+
+
+def _pointer(context: Any, builder: Any, kind: Any, arguments: Any, wanted: Any) -> Any:
+    """Where pixel (y, x) of an array begins; arguments: array, y, x."""
+    array = context.make_array(kind)(context, builder, arguments[0])
+    place = cgutils.get_item_pointer(context, builder, kind, array, list(arguments[1:]))
+    return builder.bitcast(place, wanted.as_pointer())
 
 
 @njit(cache=True, inline="always")
-def word_at_least(values: Bytes, y: int, x: int, number: int, least: np.uint8) -> np.uint64:
-    """A word of the mask of the values that have this level: those of row `y` from column `x` on."""
+def word_at_least(values: Any, y: int, x: int, number: int, least: Any) -> np.uint64:
+    """A word of the mask of the values that have this level: `number` of those of row `y` from column `x` on."""
+    if number == WORD:
+        return _whole_word_at_least(values, y, x, least)  # type: ignore[no-any-return]
     word = _ZERO
     for j in range(number):
         word |= np.uint64(values[y, x + j] >= least) << np.uint64(j)
@@ -91,6 +132,9 @@ def word_at_least(values: Bytes, y: int, x: int, number: int, least: np.uint8) -
 
 @njit(cache=True, inline="always")
 def _spread_word(word: np.uint64, out: Bytes, y: int, x: int, number: int) -> None:
+    if number == WORD:
+        _spread_whole_word(word, out, y, x)
+        return
     for j in range(number):
         out[y, x + j] = np.uint8(255) * np.uint8((word >> np.uint64(j)) & _ONE)
 
@@ -138,32 +182,66 @@ def inverse(mask: Bits, width: int) -> Bits:
     return out
 
 
-@njit(cache=True)
-def to_right(mask: Bits, y: int, k: int) -> np.uint64:
-    """Word `k` of row `y` when it is moved to the right by one pixel."""
-    return (mask[y, k] << _ONE) | (mask[y, k - 1] >> _LAST if k > 0 else _ZERO)  # type: ignore[no-any-return]
+# What follows moves whole masks by some pixels. They are brought into one line of words for it, with an empty word
+# behind each row and `margin` empty rows above and below: nothing flows from row to row, the loops need not know of
+# rows, and so they run on vectors though a row has few words.
 
 
 @njit(cache=True)
-def to_left(mask: Bits, y: int, k: int) -> np.uint64:
-    """Word `k` of row `y` when it is moved to the left by one pixel."""
-    after = mask[y, k + 1] << _LAST if k + 1 < mask.shape[1] else _ZERO
-    return (mask[y, k] >> _ONE) | after  # type: ignore[no-any-return]
-
-
-@njit(cache=True)
-def beside(mask: Bits) -> Bits:
-    """The pixels with some of their four neighbours set. (Those from W on are not cleared.)"""
+def _in_line(mask: Bits, margin: int) -> Bits:
+    """A mask [H, N] as [1 + (H + 2 margin) (N + 1)]: word `k` of row `y` is at 1 + (margin + y) (N + 1) + k."""
     height, number = mask.shape
-    out = np.empty_like(mask)
+    line = np.zeros(1 + (height + 2 * margin) * (number + 1), dtype=np.uint64)
+    rows = line[1 + margin * (number + 1) :]
     for y in range(height):
         for k in range(number):
-            out[y, k] = to_right(mask, y, k) | to_left(mask, y, k)
-        if y > 0:
-            for k in range(number):
-                out[y, k] |= mask[y - 1, k]
-                out[y - 1, k] |= mask[y, k]
+            rows[y * (number + 1) + k] = mask[y, k]
+    return line
+
+
+@njit(cache=True)
+def _in_rows(line: Bits, height: int, width: int) -> Bits:
+    """What `_in_line` made a line of, with `line` beginning at its first row; bits from W on are cleared."""
+    number = words(width)
+    out = np.empty((height, number), dtype=np.uint64)
+    for y in range(height):
+        for k in range(number):
+            out[y, k] = line[y * (number + 1) + k]
+    inside = between(0, width, number - 1)
+    for y in range(height):
+        out[y, number - 1] &= inside
     return out
+
+
+@njit(cache=True)
+def _to_both_sides(line: Bits, by: int, out: Bits) -> None:
+    """A line and what it becomes when it is moved by some pixels, fewer than WORD, to the right and to the left."""
+    shift, rest = np.uint64(by), np.uint64(WORD - by)
+    for i in range(1, line.size - 1):
+        here = line[i]
+        out[i] = here | (here << shift) | (line[i - 1] >> rest) | (here >> shift) | (line[i + 1] << rest)
+
+
+@njit(cache=True)
+def _either(a: Bits, b: Bits, out: Bits) -> None:
+    for i in range(out.size):
+        out[i] |= a[i] | b[i]
+
+
+@njit(cache=True)
+def beside(mask: Bits, width: int) -> Bits:
+    """The pixels with some of their four neighbours set."""
+    height, number = mask.shape
+    pitch, size = number + 1, height * (number + 1)
+    line = _in_line(mask, 1)
+    out = np.zeros(size, dtype=np.uint64)
+    here, before, after = line[pitch + 1 :], line[pitch:], line[pitch + 2 :]
+    for i in range(size):
+        out[i] = (here[i] << _ONE) | (before[i] >> _LAST)
+    for i in range(size):
+        out[i] |= (here[i] >> _ONE) | (after[i] << _LAST)
+    _either(line[1 : size + 1], line[2 * pitch + 1 :], out)
+    return _in_rows(out, height, width)  # type: ignore[no-any-return]
 
 
 @njit(cache=True)
@@ -173,45 +251,36 @@ def mostly(mask: Bits, width: int) -> Bits:
     The outermost pixels are cleared.
     """
     height, number = mask.shape
-    out = np.zeros_like(mask)
+    pitch, size = number + 1, height * (number + 1)
+    line = _in_line(mask, 1)
+    above, level, below = line[1:], line[pitch + 1 :], line[2 * pitch + 1 :]
     # How many pixels are set of three above each other, as two binary digits.
-    ones, twos = np.empty((1, number), dtype=np.uint64), np.empty((1, number), dtype=np.uint64)
-    for y in range(1, height - 1):
-        for k in range(number):
-            a, b, c = mask[y - 1, k], mask[y, k], mask[y + 1, k]
-            ones[0, k] = a ^ b ^ c
-            twos[0, k] = (a & b) | (c & (a ^ b))
-        for k in range(number):
-            a, b, c = to_right(ones, 0, k), ones[0, k], to_left(ones, 0, k)
-            odd = a ^ b ^ c
-            # The number is odd + 2 * (how many of these four are set).
-            p, q, r, s = (a & b) | (c & (a ^ b)), to_right(twos, 0, k), twos[0, k], to_left(twos, 0, k)
-            two = ((p | q) & (r | s)) | (p & q) | (r & s)
-            three = (p & q & (r | s)) | (r & s & (p | q))
-            out[y, k] = three | (two & odd)
-        out[y, 0] &= ~_ONE
-        out[y, number - 1] &= between(0, width - 1, number - 1)
-    return out
-
-
-@njit(cache=True)
-def _widen(mask: Bits, y: int, reach: int, out: Bits) -> None:
-    """A row with `reach` pixels more on both sides of what is set, into [N]; bits from W on are not cleared."""
-    number = mask.shape[1]
-    for k in range(number):
-        out[k] = mask[y, k]
-    done = 0
-    while done < reach:
-        # What grew by so many leaves no gap when it is moved by one more, even where one side of it is cut off.
-        step = min(done + 1, reach - done, WORD - 1)
-        by, rest = np.uint64(step), np.uint64(WORD - step)
-        before = _ZERO
-        for k in range(number):
-            here = out[k]
-            after = out[k + 1] if k + 1 < number else _ZERO
-            out[k] = here | (here << by) | (before >> rest) | (here >> by) | (after << rest)
-            before = here
-        done += step
+    ones, twos = np.zeros((2, size + 2), dtype=np.uint64)
+    for i in range(size):
+        ones[i + 1] = above[i] ^ level[i] ^ below[i]
+    for i in range(size):
+        twos[i + 1] = (above[i] & level[i]) | (below[i] & (above[i] ^ level[i]))
+    out = np.empty(size, dtype=np.uint64)
+    for i in range(size):
+        a = (ones[i + 1] << _ONE) | (ones[i] >> _LAST)
+        b = ones[i + 1]
+        c = (ones[i + 1] >> _ONE) | (ones[i + 2] << _LAST)
+        q = (twos[i + 1] << _ONE) | (twos[i] >> _LAST)
+        r = twos[i + 1]
+        s = (twos[i + 1] >> _ONE) | (twos[i + 2] << _LAST)
+        odd = a ^ b ^ c
+        # The number is odd + 2 * (how many of these four are set).
+        p = (a & b) | (c & (a ^ b))
+        two = ((p | q) & (r | s)) | (p & q) | (r & s)
+        three = (p & q & (r | s)) | (r & s & (p | q))
+        out[i] = three | (two & odd)
+    found = _in_rows(out, height, width)
+    for y in range(height):
+        found[y, 0] &= ~_ONE
+        found[y, number - 1] &= between(0, width - 1, number - 1)
+    found[0] = _ZERO
+    found[height - 1] = _ZERO
+    return found  # type: ignore[no-any-return]
 
 
 @njit(cache=True)
@@ -226,27 +295,25 @@ def dilate(mask: Bits, width: int, reaches: Widths) -> Bits:
     """
     height, number = mask.shape
     radius = len(reaches) // 2
-    out = np.zeros_like(mask)
-    wide = np.empty(number, dtype=np.uint64)
-    for y in range(height):
-        some = _ZERO
-        for k in range(number):
-            some |= mask[y, k]
-        if some == _ZERO:
-            continue
-        for d in range(radius + 1):
-            if d == 0 or reaches[d] != reaches[d - 1]:
-                _widen(mask, y, reaches[d], wide)
-            up, down = y - radius + d, y + radius - d
-            if up >= 0:
-                for k in range(number):
-                    out[up, k] |= wide[k]
-            if down < height and down != up:
-                for k in range(number):
-                    out[down, k] |= wide[k]
-    for y in range(height):
-        out[y, number - 1] &= between(0, width, number - 1)
-    return out
+    pitch, size = number + 1, height * (number + 1)
+    wide = _in_line(mask, radius + 1)
+    wider = np.zeros_like(wide)
+    out = np.zeros(size, dtype=np.uint64)
+    done = 0
+    for d in range(radius + 1):
+        while done < reaches[d]:
+            # What grew by so many leaves no gap when it is moved by one more, even where one side of it is cut off.
+            step = min(done + 1, reaches[d] - done, WORD - 1)
+            _to_both_sides(wide, step, wider)
+            wide, wider = wider, wide
+            for y in range(height):
+                wide[(radius + 2 + y) * pitch] = _ZERO  # nor may anything flow on by the empty words in between
+            wide[(radius + 1) * pitch] = _ZERO
+            done += step
+        up = 1 + (1 + d) * pitch
+        down = 1 + (1 + 2 * radius - d) * pitch
+        _either(wide[up : up + size], wide[down : down + size], out)
+    return _in_rows(out, height, width)  # type: ignore[no-any-return]
 
 
 @njit(cache=True)
@@ -259,31 +326,28 @@ def erode(mask: Bits, width: int, reaches: Widths) -> Bits:
 def runs_of(mask: Bits, width: int) -> Runs:
     """The runs [R, 3] (ROW, START, END) of pixels that are set, row by row."""
     height, number = mask.shape
-    runs = np.empty((4 * height, 3), dtype=np.int32)
+    # Where runs start and end, in turn, with the row of each: no need to ask which of both it is.
+    turns = np.empty((2, 8 * height + 2 * WORD), dtype=np.int32)
     found = 0
     for y in range(height):
         last = _ZERO
-        inside = False
         for k in range(number):
             word = mask[y, k]
-            turns = word ^ ((word << _ONE) | (last >> _LAST))  # where a pixel is not as the one before
+            bits = word ^ ((word << _ONE) | (last >> _LAST))  # where a pixel is not as the one before
             last = word
-            while turns != _ZERO:
-                x = WORD * k + lowest(turns)
-                turns &= turns - _ONE
-                if inside:
-                    runs[found, END] = x
-                    found += 1
-                else:
-                    if found == len(runs):
-                        runs = np.concatenate((runs, np.empty_like(runs)))
-                    runs[found, ROW] = y
-                    runs[found, START] = x
-                inside = not inside
-        if inside:
-            runs[found, END] = width
+            if found + WORD >= turns.shape[1]:
+                turns = np.concatenate((turns, np.empty_like(turns)), axis=1)
+            while bits != _ZERO:
+                turns[0, found], turns[1, found] = y, WORD * k + lowest(bits)
+                bits &= bits - _ONE
+                found += 1
+        if found % 2:
+            turns[0, found], turns[1, found] = y, width
             found += 1
-    return runs[:found]
+    runs = np.empty((found // 2, 3), dtype=np.int32)
+    for n in range(len(runs)):
+        runs[n, ROW], runs[n, START], runs[n, END] = turns[0, 2 * n], turns[1, 2 * n], turns[1, 2 * n + 1]
+    return runs
 
 
 @njit(cache=True)

@@ -33,7 +33,9 @@ from limbloc_ros.core._bit_kernels import (
     mostly,
     runs_of,
     set_runs,
+    spread,
     spread_row,
+    words,
 )
 from limbloc_ros.core._union_kernels import join
 
@@ -139,7 +141,7 @@ def add_body_parts(
     """
     height, width = colour.shape
     top, bottom, left, right = box
-    by_mask, by_background = beside(mask), beside(inverse(mask | changed, width))
+    by_mask, by_background = beside(mask, width), beside(inverse(mask | changed, width), width)
     runs = runs_of(changed & ~mask, width)
     parts = parts_of(runs, False)
     size = np.zeros(len(runs), dtype=np.int64)
@@ -199,20 +201,17 @@ def _both(values: Bytes, flags: Bytes, out: Bytes) -> None:
 
 
 @njit(cache=True)
-def _tallest(rows: Bytes, out: Bytes) -> None:
-    """The largest in each column of five rows."""
-    a, b, c, d, e = rows[0], rows[1], rows[2], rows[3], rows[4]
+def _most_of_five(a: Bytes, b: Bytes, c: Bytes, d: Bytes, e: Bytes, out: Bytes) -> None:
     for x in range(out.size):
         out[x] = max(max(max(a[x], b[x]), max(c[x], d[x])), e[x])
 
 
 @njit(cache=True)
-def _reaches(values: Bytes, tallest: Bytes, fraction: np.uint16, out: Bytes) -> None:
-    """1 where a value is at least a fraction of the largest within two columns: `tallest` begins two to the left."""
+def _reaches(values: Bytes, most: Bytes, fraction: np.uint16, out: Bytes) -> None:
+    """1 where a value is at least a fraction of another one."""
     half = np.uint16(FRACTION // 2)
-    for x in range(values.size):
-        most = max(max(max(tallest[x], tallest[x + 1]), max(tallest[x + 3], tallest[x + 4])), tallest[x + 2])
-        out[x] = np.uint8(np.uint16(values[x]) >= np.uint16((np.uint16(most) * fraction + half) >> np.uint16(8)))
+    for x in range(out.size):
+        out[x] = np.uint8(np.uint16(values[x]) >= np.uint16((np.uint16(most[x]) * fraction + half) >> np.uint16(8)))
 
 
 @njit(cache=True)
@@ -225,20 +224,19 @@ def trim(mask: Bits, core: Bits, change: Bytes, fraction: int) -> None:
         fraction: in units of 1 / FRACTION.
     """
     height, width = change.shape
-    # Five rows of the change inside the mask, each with two empty pixels at both ends.
-    inside = np.zeros((5, width + 4), dtype=np.uint8)
-    tallest = np.zeros(width + 4, dtype=np.uint8)
-    flags = np.zeros((height, width), dtype=np.uint8)
-    for y in range(height + 2):
-        row = inside[y % 5, 2 : width + 2]
-        if y < height:
-            spread_row(mask, y, flags, y, width)
-            _both(change[y], flags[y], row)
-        else:
-            row[:] = 0
-        if y >= 2:
-            _tallest(inside, tallest)
-            _reaches(change[y - 2], tallest, np.uint16(fraction), flags[y - 2])
+    pitch, fraction_of = width + 4, np.uint16(fraction)
+    # The change inside the mask, with two empty pixels on all sides; as one long line, which costs less than many short
+    # ones.
+    flags, inside = spread(mask, width), np.zeros((height + 4, pitch), dtype=np.uint8)
+    for y in range(height):
+        _both(change[y], flags[y], inside[y + 2, 2:-2])
+    line, size = inside.reshape(-1), height * pitch
+    tallest, most = np.empty(size, dtype=np.uint8), np.empty((height, pitch), dtype=np.uint8)
+    _most_of_five(line, line[pitch:], line[2 * pitch :], line[3 * pitch :], line[4 * pitch :], tallest)
+    out = most.reshape(-1)[: size - 4]
+    _most_of_five(tallest, tallest[1:], tallest[2:], tallest[3:], tallest[4:], out)
+    for y in range(height):
+        _reaches(change[y], most[y], fraction_of, flags[y])
     mask &= core | at_least(flags, 1)
 
 
@@ -313,22 +311,130 @@ def silhouette(
 
 
 @njit(cache=True)
-def place(part: Bits, top: int, left: int, rim: Widths, mask: Bytes, busy: Bits) -> int:
+def _cut_out(values: Bytes, top: int, bottom: int, left: int, right: int) -> Bytes:
+    """The rows `top` to before `bottom` of the columns `left` to before `right`."""
+    out = np.empty((bottom - top, right - left), dtype=np.uint8)
+    for y in range(len(out)):
+        row = values[top + y, left:right]
+        for x in range(out.shape[1]):
+            out[y, x] = row[x]
+    return out
+
+
+@njit(cache=True)
+def _least_of(a: Bytes, b: Bytes, c: Bytes, out: Bytes) -> None:
+    for x in range(out.size):
+        out[x] = min(min(a[x], b[x]), c[x])
+
+
+@njit(cache=True)
+def _most_of(a: Bytes, b: Bytes, c: Bytes, out: Bytes) -> None:
+    for x in range(out.size):
+        out[x] = max(max(a[x], b[x]), c[x])
+
+
+@njit(cache=True)
+def _middle_of(a: Bytes, b: Bytes, c: Bytes, out: Bytes) -> None:
+    for x in range(out.size):
+        out[x] = max(min(a[x], b[x]), min(max(a[x], b[x]), c[x]))
+
+
+@njit(cache=True)
+def median_of_nine(values: Bytes) -> Bytes:
+    """The median of each pixel's neighbourhood; the outermost pixels count as their neighbours outside as well."""
+    height, width = values.shape
+    pitch = width + 2
+    padded = np.empty((height + 2, pitch), dtype=np.uint8)
+    for y in range(height + 2):
+        row, out = values[min(max(y - 1, 0), height - 1)], padded[y]
+        out[0], out[-1] = row[0], row[-1]
+        for x in range(width):
+            out[x + 1] = row[x]
+    # Across the ends of rows as well: one long loop costs less than many short ones.
+    line, size = padded.reshape(-1), height * pitch
+    above, here, below = line[:size], line[pitch:], line[2 * pitch :]
+    some = np.empty((6, size), dtype=np.uint8)
+    low, middle, high, low3, middle3, high3 = some[0], some[1], some[2], some[3], some[4], some[5]
+    _least_of(above, here, below, low)
+    _middle_of(above, here, below, middle)
+    _most_of(above, here, below, high)
+    _most_of(low, low[1:], low[2:], low3[:-2])
+    _middle_of(middle, middle[1:], middle[2:], middle3[:-2])
+    _least_of(high, high[1:], high[2:], high3[:-2])
+    _middle_of(low3, middle3, high3, line[: size - 2])
+    return _cut_out(padded, 0, height, 0, width)  # type: ignore[no-any-return]
+
+
+@njit(cache=True)
+def clean(
+    change: Bytes,
+    colour: Bytes,
+    changed_level: int,
+    weak_level: int,
+    strong_level: int,
+    reach: int,
+    opening: Widths,
+    closing: Widths,
+    cloth: float,
+    border_ratio: float,
+    hole: float,
+    fraction: int,
+    least: float,
+) -> Bits:
+    """From evidence to a silhouette, in one call: `foreground` and `silhouette`, with their arguments.
+
+    Args:
+        change, colour: [H, W] evidence; may be empty.
+        reach: `silhouette` looks at the foreground and this many pixels around it.
+    """
+    width = change.shape[1]
+    if change.size == 0:
+        return np.zeros((0, 0), dtype=np.uint64)
+    changed, mask = foreground(change, colour, changed_level, weak_level, strong_level)
+    top, bottom, left, right = box_around(mask, width, reach)
+    if bottom < top:
+        return mask  # type: ignore[no-any-return]
+    bottom += 1
+    first, last = left // WORD, right // WORD + 1
+    begin, end = WORD * first, min(WORD * last, width)
+    cleaned = silhouette(
+        mask[top:bottom, first:last].copy(),
+        changed[top:bottom, first:last].copy(),
+        _cut_out(change, top, bottom, begin, end),
+        median_of_nine(_cut_out(colour, top, bottom, begin, end)),
+        opening,
+        closing,
+        cloth,
+        border_ratio,
+        (0, bottom - 1 - top, left - begin, right - begin),
+        hole,
+        fraction,
+        least,
+    )
+    mask[:] = np.uint64(0)
+    mask[top:bottom, first:last] = cleaned
+    return mask  # type: ignore[no-any-return]
+
+
+@njit(cache=True)
+def place(part: Bits, top: int, left: int, rim: Widths, height: int, width: int) -> tuple[Bytes, Bits, int]:
     """Put the mask of a part of an image where it belongs.
 
     The outermost pixels of the image, which cannot be judged by their neighbours, follow the next ones.
 
     Args:
-        part: [h, n] bits.
+        part: [h, n] bits; may be empty.
         top, left: where in the image it begins; `left` is a multiple of WORD.
         rim: window, as for `dilate`.
-        mask: [H, W] out, 255 where the part is set; 0 before.
-        busy: [H, N] bits, out: that, and `rim` around it; 0 before.
+        height, width: H and W of the image.
 
     Returns:
-        how many pixels are set.
+        [H, W] the image's mask, 255 where the part is set; [H, N] bits, the same and `rim` around it; and how many
+        pixels are set.
     """
-    height, width = mask.shape
+    mask, busy = np.zeros((height, width), dtype=np.uint8), np.zeros((height, words(width)), dtype=np.uint64)
+    if part.size == 0:
+        return mask, busy, 0
     first, rows = left // WORD, len(part)
     wide = min(WORD * part.shape[1], width - left)
     last = wide - 1
@@ -343,9 +449,10 @@ def place(part: Bits, top: int, left: int, rim: Widths, mask: Bytes, busy: Bits)
     if top + rows == height:
         part[-1] = part[-2]
     around = dilate(part, wide, rim)
+    columns = mask[:, left:]
     total = 0
     for y in range(rows):
         busy[top + y, first : first + part.shape[1]] = around[y]
-        spread_row(part, y, mask[:, left:], top + y, wide)
+        spread_row(part, y, columns, top + y, wide)
         total += count_in(part, y, 0, wide)
-    return total
+    return mask, busy, total

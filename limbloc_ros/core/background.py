@@ -28,7 +28,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from limbloc_ros.core._background_kernels import add_to_mean, fix_all, learn
+from limbloc_ros.core._background_kernels import add_to_mean, fix_all, learn, sampled
 from limbloc_ros.core._bit_kernels import no_pixels, spread
 from limbloc_ros.core._mask_kernels import place
 from limbloc_ros.core.background_estimate import BackgroundEstimate, estimate_background, light_over, noise_variance
@@ -39,7 +39,9 @@ from limbloc_ros.core.background_evidence import (
     Look,
     at_working_size,
     change_level,
+    light_change,
     light_of,
+    light_stride,
     look_at,
     measure_evidence,
     planes_of,
@@ -274,7 +276,7 @@ class BackgroundModel:
             if self._learned >= self._config.learning_frames:
                 self._finish_learning()
             return self._no_mask()
-        last, self._gain = self._gain, light_of(image, self._level, self._busy, self._gain)
+        last, self._gain = self._gain, light_of(image, self._samples, self._busy, self._gain)
         if not self._noise_known:
             self._estimate_noise(image)
         looked = self._look(image)
@@ -284,20 +286,18 @@ class BackgroundModel:
             moved = self._light_jumped(image)
             if moved is not None:
                 return self._no_mask(light_jump=True, moved=moved)
-        switched = float(np.abs(np.log(self._gain / last)).max()) > SWITCHED and self._recall(image, 0.8 * looked.share)
+        switched = light_change(self._gain, last) > SWITCHED and self._recall(image, 0.8 * looked.share)
         if switched or looked.share > self._config.relearn_fraction or self._partly_jumped(image, looked):
             looked = self._look(image)
         self._upset, self._fresh = 0, False
         evidence = self._measure(image, looked)
         if not self._doubts:
             self._before, self._share = evidence, looked.share
-        mask, self._busy, count = np.zeros(image.shape[:2], dtype=np.uint8), no_pixels(*image.shape[:2]), 0
-        if evidence.change.size:
-            part = clean_mask(evidence.change, evidence.colour, self._config, scale_of(mask.size))
-            count = place(part, evidence.top, evidence.left, _RIM, mask, self._busy)
+        part = clean_mask(evidence.change, evidence.colour, self._config, scale_of(image.size // 3))
+        mask, self._busy, count = place(part, evidence.top, evidence.left, _RIM, *image.shape[:2])
         if not self._frozen and self._config.learning_rate > 0:
             self._follow(image, looked)
-        fraction, gain = count / mask.size, tuple(map(float, self._gain))
+        fraction, gain = count / mask.size, tuple(self._gain.tolist())
         return Segmentation(self._full_size(mask), False, self._learned, fraction, False, gain)
 
     def _working(self, image: Bytes) -> Bytes:
@@ -375,6 +375,8 @@ class BackgroundModel:
         self._level = np.empty(self._mean.shape, dtype=np.uint16)
         self._sharpness = np.empty_like(self._level)
         fix_all(self._mean, self._variance, floor, weight, self._level, self._sharpness)
+        self._stride = light_stride(self._mean[0].size)
+        self._samples = sampled(self._level, self._stride)
 
     def _weight_and_floor(self) -> tuple[np.float32, np.float32]:
         # Three copies of one channel must not count as three measurements.
@@ -398,7 +400,7 @@ class BackgroundModel:
         """Let the background pixels of this image's share of rows learn."""
         weight, floor = self._weight_and_floor()
         rate = np.float32(1.0 - (1.0 - self._config.learning_rate) ** LEARNED_ROWS)
-        model = self._mean, self._variance, self._level, self._sharpness, self._gain
+        model = self._mean, self._variance, self._level, self._sharpness, self._samples, self._stride, self._gain
         turn = looked.first, LOOKED_ROWS, self._turn // LOOKED_ROWS, LEARNED_ROWS // LOOKED_ROWS
         learn(image, *model, self._busy, looked.changed, rate, floor, weight, *turn)
         self._turn = (self._turn + 1) % LEARNED_ROWS
@@ -468,7 +470,7 @@ class BackgroundModel:
             self._mean, self._variance = former[0], former[1].astype(np.float32)
             self._fix_model()
             nobody = no_pixels(*self._mean.shape[1:])
-            self._gain = light_of(image, self._level, nobody, _ONES)
+            self._gain = light_of(image, self._samples, nobody, _ONES)
             if self._look(image).share > most:
                 continue
             del self._former[n]

@@ -12,7 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from limbloc_ros.core._background_kernels import LEVEL_SCALE, densest_mean, light_gain
+from limbloc_ros.core._background_estimate_kernels import densest_mean
+from limbloc_ros.core._background_kernels import LEVEL_SCALE, light_gain, sampled
 from limbloc_ros.core._bit_kernels import no_pixels
 from limbloc_ros.core.background_evidence import light_stride
 from limbloc_ros.core.errors import InputError
@@ -94,7 +95,8 @@ def estimate_background(frames: Iterable[Bytes], share: float = 0.4) -> Backgrou
     middle = np.ascontiguousarray(fixed_levels(np.median(spread, axis=0)).transpose(2, 0, 1))
     nobody = no_pixels(*middle.shape[1:])
     ones = np.ones(3, dtype=np.float32)
-    gains = np.stack([light_gain(f, middle, nobody, ones, 4) for f in samples])
+    levels = sampled(middle, 4)
+    gains = np.stack([light_gain(f, levels, nobody, ones, 4) for f in samples])
     mean, sigma = densest_mean(samples, gains, share)
     return BackgroundEstimate(mean, sigma)
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from limbloc_ros.core import _mask_kernels as kernels
-from limbloc_ros.core._bit_kernels import WORD, Bits
+from limbloc_ros.core._bit_kernels import Bits
 from limbloc_ros.core.background_evidence import change_level, colour_level
 from limbloc_ros.core.config import BackgroundConfig
 
@@ -43,32 +43,22 @@ def clean_mask(change: Bytes, colour: Bytes, config: BackgroundConfig, scale: fl
     Returns:
         the mask, one bit per pixel (`_bit_kernels`).
     """
-    width, weak_colour = change.shape[1], colour_level(config)
-    strong_colour = min(2 * weak_colour, 255)
-    changed, mask = kernels.foreground(change, colour, change_level(config), weak_colour, strong_colour)
-    # What follows looks at the foreground and a rim around it only, in whole words.
-    top, bottom, left, right = kernels.box_around(mask, width, BODY_REACH + int(2 * config.close_px * scale))
-    if bottom < top:
-        return mask  # type: ignore[no-any-return]
-    rows, words = slice(top, bottom + 1), slice(left // WORD, right // WORD + 1)
-    pixels = rows, slice(WORD * words.start, min(WORD * words.stop, width))
-    cleaned = kernels.silhouette(
-        mask[rows, words].copy(),
-        changed[rows, words].copy(),
-        change[pixels].copy(),
-        cv2.medianBlur(colour[pixels], 3),
+    weak_colour = colour_level(config)
+    return kernels.clean(  # type: ignore[no-any-return]
+        change,
+        colour,
+        change_level(config),
+        weak_colour,
+        min(2 * weak_colour, 255),
+        BODY_REACH + int(2 * config.close_px * scale),
         disc(config.open_px * scale),
         disc(config.close_px * scale),
         CLOTH_COLOUR * weak_colour,
         BODY_BORDER,
-        (0, bottom - top, left - pixels[1].start, right - pixels[1].start),
         config.max_hole_px * scale**2,
         round(config.edge_fraction * kernels.FRACTION),
         config.min_blob_px * scale**2,
     )
-    mask.fill(0)
-    mask[rows, words] = cleaned
-    return mask  # type: ignore[no-any-return]
 
 
 @functools.cache
