@@ -3,14 +3,14 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import map_coordinates
-from scipy.spatial import cKDTree
 
+from limbloc_ros.core._parts_kernels import nearest_distances
 from limbloc_ros.core.errors import NoPerson
 from limbloc_ros.core.hull import NOBODY, Hull, components, largest_component
 from limbloc_ros.core.pipeline import PoseEstimator
@@ -94,7 +94,16 @@ def candidates(hull: Hull, max_people: int) -> list[Hull]:
 
 def nearest(points: Array, query: Array) -> Array:
     """Distance [Q], m, of each of query [Q, 3] to the nearest of the points [M, 3]."""
-    return np.asarray(cKDTree(points).query(query)[0], dtype=np.float64)
+    # A tree of scipy would be no faster for some hundred points, and takes a tenth of a second to be imported.
+    # Copies, because a kernel is compiled for one kind of array only.
+    found = nearest_distances(*(np.array(a, dtype=np.float64, order="C") for a in (points, query)))
+    return np.asarray(found, dtype=np.float64)
+
+
+@functools.cache  # once per process
+def warm_up() -> None:
+    """Compile or load the kernels, so that the first frame is not slow."""
+    nearest(np.zeros((1, 3)), np.zeros((1, 3)))
 
 
 def divide(hull: Hull, distances: Sequence[Callable[[Array], Array]]) -> list[Hull | None]:
@@ -129,6 +138,8 @@ def divide(hull: Hull, distances: Sequence[Callable[[Array], Array]]) -> list[Hu
 
 def _at_voxels(hull: Hull, distance: Callable[[Array], Array], indices: NDArray[np.int32]) -> Array:
     """A signed distance [V] at voxels [V, 3], interpolated from every COARSE-th: ten times as fast, to a centimetre."""
+    from scipy.ndimage import map_coordinates  # takes time, for which those whom nobody touches need not wait
+
     axes = [np.arange(0, n + COARSE - 1, COARSE) for n in hull.sdf.shape]
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
     places = (nodes.reshape(-1, 3) + np.asarray(hull.index_min) + 0.5) * hull.voxel_m

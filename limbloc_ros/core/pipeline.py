@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from limbloc_ros.core import engine_paper, engine_robust
+from limbloc_ros.core import engine_robust
 from limbloc_ros.core.camera import Camera, Rig
 from limbloc_ros.core.confidence import Judge, Wariness, describe_pose
 from limbloc_ros.core.config import FitConfig, HullConfig, validated
@@ -27,6 +27,13 @@ _LEAST_EFFORT = engine_robust.Effort(
     torsos=1, leg_pairs=1, starts=1, survivors=1, arm_repairs=1, strict=1, single_arms=1, single_legs=1, rounds=1,
     finalists=1, quick_points=50, points=50, iterations=(1, 1, 1, 1, 1),
 )  # fmt: skip
+
+
+class _Trusting(Tracker):
+    """Does not search again for what it found, which would call the same kernels once more."""
+
+    def _doubts(self, cost: float, cut: bool) -> bool:
+        return False
 
 
 class Carver:
@@ -80,6 +87,8 @@ class PoseEstimator:
         hull = largest_component(hull)
         clock = _Stopwatch()
         if self.config.engine == "paper":
+            from limbloc_ros.core import engine_paper  # brings a tree of scipy along, for which others need not wait
+
             found = engine_paper.fit_state(hull)
             clock.lap("fit")
             if isinstance(found, NoPerson):
@@ -115,7 +124,7 @@ class PoseEstimator:
         assert isinstance(hull, Hull)
         # The first frame is searched from scratch, with the kernels of every frame alone; the second follows.
         estimator = PoseEstimator(FitConfig(temporal=True))
-        estimator._tracker = Tracker(0, searches=(_LEAST_EFFORT,))
+        estimator._tracker = _Trusting(0, searches=(_LEAST_EFFORT,))
         estimator.estimate(hull)
         estimator.estimate(hull)
 

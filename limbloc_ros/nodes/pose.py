@@ -15,6 +15,7 @@ from sensor_msgs.msg import JointState, PointCloud2
 from std_msgs.msg import Header
 from visualization_msgs.msg import MarkerArray
 
+from limbloc_ros.core import parts
 from limbloc_ros.core.config import FitConfig, setting
 from limbloc_ros.core.errors import ConfigError, NoPerson
 from limbloc_ros.core.geodesic import geodesic_map
@@ -96,6 +97,7 @@ class PoseNode(Node):
         # Before there is anything on the graph: who sees `joints` (a stepped replay) takes the node for ready.
         self.get_logger().info("loading the kernels; the first start compiles them, which may take a minute")
         PoseEstimator.warm_up()
+        parts.warm_up()
         warm_up()
         self.joints = self.create_publisher(PoseArray, topics.JOINTS, topics.STREAM_QOS)
         self.angles = self.create_publisher(JointState, topics.JOINT_ANGLES, topics.STREAM_QOS)

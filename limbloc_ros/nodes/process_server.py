@@ -36,7 +36,7 @@ NEEDED = {
     "simulated_cameras": ("simulation.room", "simulation.company", "rig.rig_file", "core.background:warm_up"),
     "segmentation": ("recordings.background_file", "recordings.videos", "core.background:warm_up"),
     "carving": ("rig.rig_file", "rig.watch", "core.synchroniser", "core.pipeline:Carver.warm_up"),
-    "pose": ("core.people", "core.ros4hri", "core.pipeline:PoseEstimator.warm_up"),
+    "pose": ("core.people", "core.ros4hri", "core.parts:warm_up", "core.pipeline:PoseEstimator.warm_up"),
     "replay": ("recordings.bags",),
     "record": ("recordings.bags",),
 }
