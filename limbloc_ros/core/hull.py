@@ -16,7 +16,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from limbloc_ros.core import _block_kernels as near
 from limbloc_ros.core import _component_kernels as apart
@@ -24,6 +23,7 @@ from limbloc_ros.core import _hull_kernels as kernels
 from limbloc_ros.core import _mending_kernels as mending_kernels
 from limbloc_ros.core import mending
 from limbloc_ros.core._hull_kernels import LEAF
+from limbloc_ros.core._nearest_kernels import nearest_distances
 from limbloc_ros.core.camera import Rig
 from limbloc_ros.core.config import HullConfig
 from limbloc_ros.core.errors import InputError, NoPerson
@@ -308,8 +308,8 @@ def _pieces_of_one_body(parts: _Parts, voxel_m: float) -> tuple[int, int] | None
             # what lies within the gap of the plane between them is all that can be so near
             middle = (bottom + top) / 2
             cut = slice(max(0, math.floor(middle - 1.5 * gap)), math.ceil(middle + 1.5 * gap))
-            above, below = (np.argwhere(parts.labels[:, :, cut] == part) for part in (upper, lower))
-            if np.min(cKDTree(above).query(below)[0]) <= gap:
+            above, below = (np.argwhere(parts.labels[:, :, cut] == part).astype(np.float64) for part in (upper, lower))
+            if nearest_distances(above, below).min() <= gap:
                 return upper, lower
     return None
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from limbloc_ros.core._parts_kernels import nearest_distances
+from limbloc_ros.core._nearest_kernels import nearest_distances
 from limbloc_ros.core.errors import NoPerson
 from limbloc_ros.core.hull import NOBODY, Hull, components, largest_component
 from limbloc_ros.core.pipeline import PoseEstimator

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Numba kernels of `parts`."""
+"""The numba kernel that finds how far the nearest of some points are; `hull` and `parts` call it."""
 
 from __future__ import annotations
 
