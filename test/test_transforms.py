@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from limbloc_ros.core.errors import RigError
 from limbloc_ros.ros import transforms
@@ -55,6 +56,17 @@ def test_flexion_swings_the_arm_forward() -> None:
 def test_the_origin_turns_before_the_joint() -> None:
     T = chain({"shoulder": 0.0, "elbow": math.pi / 2})
     np.testing.assert_allclose(T[:3, :3], np.diag([-1.0, -1.0, 1.0]), atol=1e-12)
+
+
+def test_turns_about_any_axis() -> None:
+    """Roll, pitch and yaw in the order of URDF, then a turn about an axis of any length."""
+    urdf = """<robot name="r"><link name="a"/><link name="b"/><joint name="j" type="continuous">
+      <parent link="a"/><child link="b"/><origin xyz="1 2 3" rpy="0.3 -0.5 2.0"/><axis xyz="1 -2 2"/></joint></robot>"""
+    (msg,) = link_transforms(urdf, {"j": 0.7}, make_header(7, "room"))
+    expected = Rotation.from_euler("xyz", [0.3, -0.5, 2.0]) * Rotation.from_rotvec(0.7 * np.array([1, -2, 2]) / 3)
+    T = message_to_transform(msg)
+    np.testing.assert_allclose(T[:3, :3], expected.as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(T[:3, 3], [1, 2, 3])
 
 
 def test_a_missing_angle_is_an_error_not_a_zero() -> None:

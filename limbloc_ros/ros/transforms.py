@@ -9,20 +9,21 @@ and 1e-13 degrees of tf2's. Frames that move with stamps of their own are anothe
 
 from __future__ import annotations
 
+import functools
+import math
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
-from geometry_msgs.msg import TransformStamped
+from geometry_msgs.msg import Quaternion, TransformStamped, Vector3
 from numpy.typing import NDArray
 from rclpy.node import Node
 from std_msgs.msg import Header
 
 from limbloc_ros.core.errors import InputError, RigError
 from limbloc_ros.ros import topics
-from limbloc_ros.ros.messages import message_to_transform, transform_to_message
+from limbloc_ros.ros.messages import message_to_transform
 
 Array = NDArray[np.float64]
 
@@ -162,33 +163,73 @@ def link_transforms(urdf: str, angles: Mapping[str, float], header: Header) -> l
         header: gives the stamp.
     """
     result = []
-    for joint in ET.fromstring(urdf).iter("joint"):
-        origin = joint.find("origin")
-        attributes = {} if origin is None else origin.attrib
-        T = np.eye(4)
-        T[:3, 3] = _numbers(attributes.get("xyz", "0 0 0"))
-        roll, pitch, yaw = _numbers(attributes.get("rpy", "0 0 0"))
-        R = _turn(_Z * yaw) @ _turn(_Y * pitch) @ _turn(_X * roll)
-        if joint.attrib["type"] != "fixed":
-            axis = joint.find("axis")
-            direction = _numbers("1 0 0" if axis is None else axis.attrib["xyz"])
-            R = R @ _turn(angles[joint.attrib["name"]] * direction)
-        T[:3, :3] = R
-        parent, child = (joint.find(tag).attrib["link"] for tag in ("parent", "child"))  # type: ignore[union-attr]
-        result.append(transform_to_message(T, child, Header(stamp=header.stamp, frame_id=parent)))
+    for link in _links(urdf):
+        half = 0.0 if link.joint is None else 0.5 * angles[link.joint]
+        turn = tuple(math.sin(half) * component for component in link.axis)
+        x, y, z, w = _product(link.rotation, (*turn, math.cos(half)))
+        msg = TransformStamped(header=Header(stamp=header.stamp, frame_id=link.parent), child_frame_id=link.child)
+        msg.transform.translation = Vector3(**dict(zip("xyz", link.translation, strict=True)))
+        msg.transform.rotation = Quaternion(x=x, y=y, z=z, w=w)
+        result.append(msg)
     return result
 
 
-_X, _Y, _Z = np.eye(3)
+class _Link(NamedTuple):
+    """A link of a robot description, and how it turns in its parent.
+
+    Attributes:
+        joint: which joint turns it; None: it is fixed.
+        axis: about which, of length 1.
+        translation, rotation: (m, and x, y, z, w) of it in its parent at angle 0.
+    """
+
+    parent: str
+    child: str
+    joint: str | None
+    axis: tuple[float, ...]
+    translation: tuple[float, ...]
+    rotation: tuple[float, ...]
 
 
-def _turn(vector: Array) -> Array:
-    """Rotation vector [3], rad -> rotation matrix [3, 3]."""
-    return np.asarray(cv2.Rodrigues(vector)[0])
+@functools.lru_cache(maxsize=16)  # the newest description of each person: reading one takes longer than a frame has
+def _links(urdf: str) -> tuple[_Link, ...]:
+    links = []
+    for joint in ET.fromstring(urdf).iter("joint"):
+        origin, axis = joint.find("origin"), joint.find("axis")
+        attributes = {} if origin is None else origin.attrib
+        rotation: tuple[float, ...] = (0.0, 0.0, 0.0, 1.0)
+        for angle, k in zip(_numbers(attributes.get("rpy", "0 0 0"))[::-1], (2, 1, 0), strict=True):
+            turn = [0.0, 0.0, 0.0, math.cos(angle / 2)]
+            turn[k] = math.sin(angle / 2)
+            rotation = _product(rotation, turn)
+        direction = _numbers("1 0 0" if axis is None else axis.attrib["xyz"])
+        parent, child = (joint.find(tag).attrib["link"] for tag in ("parent", "child"))  # type: ignore[union-attr]
+        links.append(
+            _Link(
+                parent,
+                child,
+                None if joint.attrib["type"] == "fixed" else joint.attrib["name"],
+                tuple(component / math.hypot(*direction) for component in direction),
+                _numbers(attributes.get("xyz", "0 0 0")),
+                rotation,
+            )
+        )
+    return tuple(links)
 
 
-def _numbers(text: str) -> Array:
-    return np.array([float(word) for word in text.split()])
+def _product(p: Sequence[float], q: Sequence[float]) -> tuple[float, float, float, float]:
+    """The turn q, and then p, as x, y, z, w."""
+    (a, b, c, d), (x, y, z, w) = p, q
+    return (
+        d * x + a * w + b * z - c * y,
+        d * y - a * z + b * w + c * x,
+        d * z + a * y - b * x + c * w,
+        d * w - a * x - b * y - c * z,
+    )
+
+
+def _numbers(text: str) -> tuple[float, ...]:
+    return tuple(float(word) for word in text.split())
 
 
 def _bare(frame: str) -> str:
