@@ -10,6 +10,7 @@ from camera_rings import ball_masks, ring, who_cut
 from scipy import ndimage
 
 from limbloc_ros.core import hull as hulls
+from limbloc_ros.core import pipeline
 from limbloc_ros.core.config import HullConfig
 from limbloc_ros.core.errors import InputError
 from limbloc_ros.core.hull import NOBODY, Hull, carve, components, largest_component
@@ -197,6 +198,34 @@ def test_three_pieces_of_one_body_are_one_part():
         solid[2:10, 2:10, low : low + 10] = True
     solid[20:28, 2:10, 2:40] = True  # and somebody else
     assert [piece.inside_count for piece in components(hull_of(solid, 0.02, 0.06))] == [8 * 8 * 38, 3 * 8 * 8 * 10]
+
+
+def test_both_legs_below_a_trunk_belong_to_it():
+    solid = np.zeros((24, 14, 44), bool)
+    solid[2:8, 2:10, 2:16] = solid[14:20, 2:10, 2:16] = True  # 12 cm from each other
+    solid[2:20, 2:10, 19:40] = True
+    for mirror in (slice(None), slice(None, None, -1)):
+        both = hull_of(solid[:, :, mirror], 0.02, 0.06)
+        (body,) = components(both)
+        assert body.inside_count == both.inside_count
+        np.testing.assert_array_equal(body.sdf < 0, both.sdf < 0)
+
+
+def test_pieces_of_a_body_are_found_by_the_kernel_that_was_warmed_up(monkeypatch):
+    """Else the first frame with a body cut in two would wait for the compiler."""
+    kinds, nearest_distances = [], hulls.nearest_distances
+
+    def nearest(*points):
+        kinds.append({(a.dtype, a.flags.c_contiguous) for a in points})
+        return nearest_distances(*points)
+
+    monkeypatch.setattr(hulls, "nearest_distances", nearest)
+    monkeypatch.setattr(pipeline, "nearest_distances", nearest)
+    solid = np.zeros((14, 14, 34), bool)
+    solid[2:10, 2:10, 2:12] = solid[2:10, 2:10, 15:30] = True
+    components(hull_of(solid, 0.02, 0.06))
+    Carver.warm_up.__wrapped__()
+    assert kinds == 2 * [{(np.dtype(float), True)}]
 
 
 def test_lattice_bounds_hold_the_centres_in_the_volume():

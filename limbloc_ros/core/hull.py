@@ -293,37 +293,40 @@ class _Parts(NamedTuple):
 
 def _parts(hull: Hull) -> _Parts:
     parts = _Parts(*apart.label_components(hull.sdf, np.float32(hull.voxel_m)))
-    while (pieces := _pieces_of_one_body(parts, hull.voxel_m)) is not None:
-        parts = _parts_joined(parts, *pieces)
-    return parts
+    pairs = _pieces_of_one_body(parts, hull.voxel_m)
+    return _parts_joined(parts, pairs) if pairs else parts
 
 
-def _pieces_of_one_body(parts: _Parts, voxel_m: float) -> tuple[int, int] | None:
-    """Two parts of which one stands over the other, if there are such."""
+def _pieces_of_one_body(parts: _Parts, voxel_m: float) -> list[tuple[int, int]]:
+    """Every two parts of which one stands over the other. Both legs may stand below one trunk."""
     large = np.flatnonzero(parts.sizes >= PIECE_SHARE * parts.sizes[1:].max(initial=0))
     gap = PIECE_GAP_M / voxel_m
+    pairs = []
     for upper, lower in itertools.permutations(large[large > 0].tolist(), 2):
-        bottom, top = parts.boxes[upper, 0, 2], parts.boxes[lower, 1, 2]
-        if abs(bottom - top) <= gap:
-            # what lies within the gap of the plane between them is all that can be so near
-            middle = (bottom + top) / 2
-            cut = slice(max(0, math.floor(middle - 1.5 * gap)), math.ceil(middle + 1.5 * gap))
-            above, below = (np.argwhere(parts.labels[:, :, cut] == part).astype(np.float64) for part in (upper, lower))
-            if nearest_distances(above, below).min() <= gap:
-                return upper, lower
-    return None
+        bottom, top = int(parts.boxes[upper, 0, 2]), int(parts.boxes[lower, 1, 2]) - 1
+        if 1 - gap <= bottom - top <= gap:
+            # nothing else of them can be so near each other
+            cut = slice(max(0, math.ceil(bottom - gap)), math.floor(top + gap) + 1)
+            ends = (np.argwhere(parts.labels[:, :, cut] == part) for part in (upper, lower))
+            # in this order of memory alone, for which the kernel is warmed up
+            if nearest_distances(*(np.ascontiguousarray(end, dtype=np.float64) for end in ends)).min() <= gap:
+                pairs.append((upper, lower))
+    return pairs
 
 
-def _parts_joined(parts: _Parts, a: int, b: int) -> _Parts:
-    """The parts, with two of them as one."""
-    kept, gone = min(a, b), max(a, b)
-    numbers = np.arange(len(parts.sizes), dtype=parts.labels.dtype)
-    numbers[gone] = kept
-    numbers[gone + 1 :] -= 1
-    sizes, boxes = parts.sizes.copy(), parts.boxes.copy()
-    sizes[kept] += sizes[gone]
-    boxes[kept] = np.minimum(boxes[a][0], boxes[b][0]), np.maximum(boxes[a][1], boxes[b][1])
-    return _Parts(numbers[parts.labels], np.delete(sizes, gone), np.delete(boxes, gone, axis=0))
+def _parts_joined(parts: _Parts, pairs: list[tuple[int, int]]) -> _Parts:
+    """The parts, with both of each pair as one."""
+    first = np.arange(len(parts.sizes))  # which part each is one with
+    for a, b in pairs:
+        first[(first == first[a]) | (first == first[b])] = min(first[a], first[b])
+    _, numbers = np.unique(first, return_inverse=True)
+    count = int(numbers.max()) + 1
+    sizes = np.zeros(count, np.int64)
+    low, high = np.full((count, 3), max(parts.labels.shape), np.int64), np.zeros((count, 3), np.int64)
+    np.add.at(sizes, numbers, parts.sizes)
+    np.minimum.at(low, numbers, parts.boxes[:, 0])
+    np.maximum.at(high, numbers, parts.boxes[:, 1])
+    return _Parts(numbers.astype(parts.labels.dtype)[parts.labels], sizes, np.stack([low, high], axis=1))
 
 
 def _people_among(hull: Hull, hull_parts: _Parts, silhouettes: Silhouettes, config: HullConfig) -> list[int]:
