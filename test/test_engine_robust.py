@@ -159,12 +159,17 @@ def test_a_doubtful_figure_is_searched_for_once_more():
     assert thrice.verdict == min(once.verdict, alone.verdict)
 
 
-@pytest.mark.parametrize(("likely", "risk", "tried"), [(1.0, 0.5, False), (1.0, 1.5, True), (0.0, 0.5, True)])
-def test_limbs_of_a_figure_that_is_hardly_wrong_stay_where_they_are(monkeypatch, likely, risk, tried):
+@pytest.mark.parametrize(
+    ("likely", "risk", "seen", "tried"),
+    [(1.0, 0.5, True, False), (1.0, 1.5, True, True), (0.0, 0.5, True, True), (1.0, 0.0, False, True)],
+)
+def test_limbs_of_a_figure_that_is_hardly_wrong_stay_where_they_are(monkeypatch, likely, risk, seen, tried):
     trials = []
     monkeypatch.setattr(engine_robust, "_with_better_limb", lambda winner, *_: trials.append(winner) or winner)
     name, frame = PEOPLE[0]
     hull = hull_of(name, frame)
+    if not seen:  # nobody knows what the cameras saw: a risk of 0 says nothing
+        hull = replace(hull, views=None)
     effort = replace(engine_robust.QUICK, torsos=1, leg_pairs=1, starts=1, certain=1e-9, likely=likely, enough=1.0)
     fit_from_scratch(hull, extract_surface(hull), 0, None, (effort,), lambda state: risk * engine_robust.CALM)
     assert bool(trials) == tried

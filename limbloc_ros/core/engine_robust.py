@@ -392,7 +392,8 @@ def _fit_from_torsos(
     winner = refine(winner.state, scene.full, scene.weights, final)
     if effort.certain > 0.0:
         judged = _judged(winner, scene)
-        asked = risk_of if judged < effort.likely else None
+        # without views the silhouettes have nothing against any figure
+        asked = risk_of if judged < effort.likely and scene.hull.views is not None else None
         if judged < effort.certain or (asked is not None and asked(winner.state) < CALM):
             return winner, rivals, judged
     for _ in range(effort.rounds):
