@@ -423,7 +423,7 @@ def place(part: Bits, top: int, left: int, rim: Widths, height: int, width: int)
     The outermost pixels of the image, which cannot be judged by their neighbours, follow the next ones.
 
     Args:
-        part: [h, n] bits; may be empty.
+        part: [h, n] bits; may be empty. Its pixels at the rim of the image are changed in place.
         top, left: where in the image it begins; `left` is a multiple of WORD.
         rim: window, as for `dilate`.
         height, width: H and W of the image.

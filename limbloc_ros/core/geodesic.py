@@ -87,7 +87,10 @@ def geodesic_distances(surface: Surface, seeds: ArrayLike, start_m: ArrayLike | 
 
 
 def geodesic_map(hull: Hull, surface: Surface) -> Array:
-    """[N] m: distance over the surface from its point nearest the centre of mass (the map of fig. 1)."""
+    """[N] m: distance over the surface from its point nearest the centre of mass (the map of fig. 1).
+
+    inf on other pieces of the surface than that point's.
+    """
     return geodesic_distances(surface, [nearest_row(surface, centre_of_mass(hull))])
 
 

@@ -269,7 +269,8 @@ def largest_component(hull: Hull) -> Hull:
 
 
 def components(hull: Hull) -> list[Hull]:
-    """Every connected part of the hull as a hull of its own, the largest first; the hull itself if it is in one."""
+    """Every part of the hull (connected, or pieces of one body) as a hull of its own, the largest first; the hull
+    itself if it is in one."""
     parts = _parts(hull)
     if len(parts.sizes) <= 2:
         return [hull]
@@ -278,7 +279,7 @@ def components(hull: Hull) -> list[Hull]:
 
 
 class _Parts(NamedTuple):
-    """The connected parts of a hull, numbered from 1 on.
+    """The parts of a hull, connected or pieces of one body, numbered from 1 on.
 
     Attributes:
         labels: int32 [nx, ny, nz] which part each voxel belongs to; 0: none.
