@@ -140,6 +140,18 @@ def test_plateau_has_one_maximum(star):
     assert len(wide_maxima(surface, np.zeros(len(surface)), 10.0).rows) == 1
 
 
+def test_the_map_leads_through_the_air_between_pieces():
+    trunk, legs = capsule([0, 0, 0.6], [0, 0, 1.2], 0.1), capsule([0, 0, 0.0], [0, 0, 0.3], 0.1)
+    hull = hull_of([trunk, legs], [-0.2, -0.2, -0.2], [0.2, 0.2, 1.4])  # 10 cm of air between them
+    surface = extract_surface(hull)
+    distance = geodesic_map(hull, surface)
+    assert np.isfinite(distance).all()
+    z = surface.points[:, 2]
+    bottom, first = distance[(z > 0.45) & (z < 0.52)], distance[z < 0.45].min()
+    assert bottom.min() + 0.08 < first < bottom.max() + 0.12
+    assert distance[z < -0.08].min() > first + 0.4  # and on, down to the feet
+
+
 def test_unreachable_and_bad_seeds(star):
     hull, surface = star
     cut = extract_surface(hull)

@@ -10,7 +10,6 @@ from camera_rings import ball_masks, ring, who_cut
 from scipy import ndimage
 
 from limbloc_ros.core import hull as hulls
-from limbloc_ros.core import pipeline
 from limbloc_ros.core.config import HullConfig
 from limbloc_ros.core.errors import InputError
 from limbloc_ros.core.hull import NOBODY, Hull, carve, components, largest_component
@@ -172,7 +171,8 @@ def test_largest_component_keeps_a_single_one_and_bridges_small_gaps():
     ("second", "joined"),
     [
         ([[3, 9], [2, 10], [16, 30]], True),  # 4 voxels of 2 cm above
-        ([[14, 22], [2, 10], [16, 30]], True),  # and aside, but within 10 cm
+        ([[7, 22], [2, 10], [16, 30]], True),  # and aside, but above some of it
+        ([[14, 22], [2, 10], [16, 30]], False),  # and beside it
         ([[3, 9], [2, 10], [20, 30]], False),  # 16 cm above
         ([[18, 26], [2, 10], [16, 30]], False),
         ([[14, 22], [2, 10], [2, 16]], False),  # beside it, 8 cm away: somebody else
@@ -211,21 +211,13 @@ def test_both_legs_below_a_trunk_belong_to_it():
         np.testing.assert_array_equal(body.sdf < 0, both.sdf < 0)
 
 
-def test_pieces_of_a_body_are_found_by_the_kernel_that_was_warmed_up(monkeypatch):
-    """Else the first frame with a body cut in two would wait for the compiler."""
-    kinds, nearest_distances = [], hulls.nearest_distances
-
-    def nearest(*points):
-        kinds.append({(a.dtype, a.flags.c_contiguous) for a in points})
-        return nearest_distances(*points)
-
-    monkeypatch.setattr(hulls, "nearest_distances", nearest)
-    monkeypatch.setattr(pipeline, "nearest_distances", nearest)
-    solid = np.zeros((14, 14, 34), bool)
-    solid[2:10, 2:10, 2:12] = solid[2:10, 2:10, 15:30] = True
-    components(hull_of(solid, 0.02, 0.06))
-    Carver.warm_up.__wrapped__()
-    assert kinds == 2 * [{(np.dtype(float), True)}]
+def test_a_belt_above_hanging_hands_does_not_cut_a_body_in_two():
+    solid = np.zeros((34, 14, 60), bool)
+    solid[8:20, 2:12, 2:26] = solid[8:20, 2:12, 30:56] = True  # legs, and a trunk 8 cm above them
+    solid[2:6, 4:8, 14:50] = solid[2:8, 4:8, 46:50] = True  # with an arm whose hand hangs lower than the belt
+    both = hull_of(solid, 0.02, 0.06)
+    (body,) = components(both)
+    assert body.inside_count == both.inside_count
 
 
 def test_lattice_bounds_hold_the_centres_in_the_volume():

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The numba kernel that finds how far the nearest of some points are; `hull` and `parts` call it."""
+"""The numba kernel that finds how far the nearest of some points are, for `parts`."""
 
 from __future__ import annotations
 

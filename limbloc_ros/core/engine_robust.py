@@ -52,8 +52,8 @@ class Effort:
         iterations: most steps of the refinements: first, survivors, repairs, under strict limits, final.
         lenient_limits: weight of joint limits at first.
         enough: an energy (m^2) below which the figure is believed and nothing more is searched.
-        certain, likely: energies below which the winner's limbs are not tried elsewhere: anyhow, and when it is not at
-            all likely to be wrong.
+        certain, likely: energies below which the winner's limbs are not tried elsewhere: anyhow, and when there is
+            next to no risk that is worth a search.
         shown: whether limbs are placed by what the silhouettes show as well; takes as long again.
         dressed: whether figures may wear loose clothes while they are searched; they begin with those of the last fit.
     """

@@ -89,9 +89,21 @@ def geodesic_distances(surface: Surface, seeds: ArrayLike, start_m: ArrayLike | 
 def geodesic_map(hull: Hull, surface: Surface) -> Array:
     """[N] m: distance over the surface from its point nearest the centre of mass (the map of fig. 1).
 
-    inf on other pieces of the surface than that point's.
+    Where the surface is in several pieces, as of a body that masks have cut in two, the way leads through the air where
+    they are nearest each other.
     """
-    return geodesic_distances(surface, [nearest_row(surface, centre_of_mass(hull))])
+    seeds, starts = [nearest_row(surface, centre_of_mass(hull))], [0.0]
+    distance = geodesic_distances(surface, seeds)
+    while not np.isfinite(distance).all():
+        from scipy.spatial import cKDTree  # takes time, for which those of one piece need not wait
+
+        reached, rest = np.flatnonzero(np.isfinite(distance)), np.flatnonzero(~np.isfinite(distance))
+        gaps, nearest = map(np.asarray, cKDTree(surface.points[reached]).query(surface.points[rest]))
+        n = int(gaps.argmin())
+        seeds.append(int(rest[n]))
+        starts.append(float(distance[reached[nearest[n]]] + gaps[n]))
+        distance = geodesic_distances(surface, seeds, starts)
+    return distance
 
 
 def extremities(surface: Surface, distance: Array, count: int) -> Maxima:

@@ -23,7 +23,6 @@ from limbloc_ros.core import _hull_kernels as kernels
 from limbloc_ros.core import _mending_kernels as mending_kernels
 from limbloc_ros.core import mending
 from limbloc_ros.core._hull_kernels import LEAF
-from limbloc_ros.core._nearest_kernels import nearest_distances
 from limbloc_ros.core.camera import Rig
 from limbloc_ros.core.config import HullConfig
 from limbloc_ros.core.errors import InputError, NoPerson
@@ -41,10 +40,10 @@ from limbloc_ros.core.views import Views
 DOUBTED_FRACTION = 0.02
 #: A part of the hull is a phantom when in all cameras but one less of what it covers is covered by it alone.
 PHANTOM_SHARE = 0.1
-#: Masks may cut a body in two, as where a belt has the wall's colour: one piece stands over the other, no further from
-#: it than this, m (less a voxel of shell on each), and has no less than this share of its volume. People side by side
-#: do not stand over each other.
-PIECE_GAP_M, PIECE_SHARE = 0.10, 0.1
+#: Masks may cut a body in two, as where a belt has the wall's colour: one piece lies above the other, no further from
+#: it than this, m (from shell to shell), on an area of no less than this, m^2 (a leg has 0.02), and has no less than
+#: this share of its volume. People side by side do not lie above each other.
+PIECE_GAP_M, PIECE_AREA_M2, PIECE_SHARE = 0.10, 0.012, 0.1
 #: A carve volume that ends below this height, m, ends at the floor.
 FLOOR_M = 0.5
 #: By so many voxels of the hull its silhouettes are told from other blobs.
@@ -299,20 +298,21 @@ def _parts(hull: Hull) -> _Parts:
 
 
 def _pieces_of_one_body(parts: _Parts, voxel_m: float) -> list[tuple[int, int]]:
-    """Every two parts of which one stands over the other. Both legs may stand below one trunk."""
+    """Every two parts of which one lies above the other. Both legs may be below one trunk."""
     large = np.flatnonzero(parts.sizes >= PIECE_SHARE * parts.sizes[1:].max(initial=0))
-    gap = PIECE_GAP_M / voxel_m
-    pairs = []
-    for upper, lower in itertools.permutations(large[large > 0].tolist(), 2):
-        bottom, top = int(parts.boxes[upper, 0, 2]), int(parts.boxes[lower, 1, 2]) - 1
-        if 1 - gap <= bottom - top <= gap:
-            # nothing else of them can be so near each other
-            cut = slice(max(0, math.ceil(bottom - gap)), math.floor(top + gap) + 1)
-            ends = (np.argwhere(parts.labels[:, :, cut] == part) for part in (upper, lower))
-            # in this order of memory alone, for which the kernel is warmed up
-            if nearest_distances(*(np.ascontiguousarray(end, dtype=np.float64) for end in ends)).min() <= gap:
-                pairs.append((upper, lower))
-    return pairs
+    pairs = itertools.permutations(large[large > 0].tolist(), 2)
+    return [(upper, lower) for upper, lower in pairs if _area_above(parts, upper, lower, voxel_m) >= PIECE_AREA_M2]
+
+
+def _area_above(parts: _Parts, upper: int, lower: int, voxel_m: float) -> float:
+    """On how much of the floor, m^2, one part lies just above the other."""
+    low = np.maximum(parts.boxes[upper, 0], parts.boxes[lower, 0])
+    high = np.minimum(parts.boxes[upper, 1], parts.boxes[lower, 1])
+    labels = parts.labels[low[0] : max(low[0], high[0]), low[1] : max(low[1], high[1])]
+    below, just_above = labels == lower, np.zeros(labels.shape, np.bool_)
+    for step in range(1, int(PIECE_GAP_M / voxel_m) + 1):
+        just_above[:, :, step:] |= below[:, :, :-step]
+    return float(np.count_nonzero((just_above & (labels == upper)).any(axis=2))) * voxel_m**2
 
 
 def _parts_joined(parts: _Parts, pairs: list[tuple[int, int]]) -> _Parts:

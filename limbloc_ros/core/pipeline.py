@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from limbloc_ros.core import engine_robust
-from limbloc_ros.core._nearest_kernels import nearest_distances
 from limbloc_ros.core.camera import Camera, Rig
 from limbloc_ros.core.confidence import Judge, Wariness, describe_pose
 from limbloc_ros.core.config import FitConfig, HullConfig, validated
@@ -63,7 +62,6 @@ class Carver:
     def warm_up() -> None:
         """Compile or load the carving kernels, so that the first frame is not slow."""
         Carver(*_warm_up_room()).carve(_warm_up_masks())
-        nearest_distances(np.zeros((1, 3)), np.zeros((1, 3)))  # asked of bodies that masks have cut in two
 
 
 class PoseEstimator:
