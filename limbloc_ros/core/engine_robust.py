@@ -100,12 +100,10 @@ SEEN_WEIGHT = 1e-2
 WORTH_A_SEARCH, CALM = 0.05, 0.003
 #: One search after the other, until the energy is low and the figure not doubtful: most are found easily. Of 492 frames
 #: the first search ended below 3e-4 in 426; 8 of these were wrong, of which 7 were doubtful, as no right one was (the
-#: frames by which both bounds were chosen). It takes two torsos, for which a third of the usual ones need be compared:
-#: of 393 frames it was wrong in 26 with either, and one of these was believed.
+#: frames by which both bounds were chosen).
 QUICK = Effort(
-    torsos=2, torso_search=search.TorsoSearch(compared=12, climbed=5), leg_pairs=2, starts=3, survivors=2,
-    arm_repairs=1, strict=2, single_arms=2, single_legs=1, rounds=1, finalists=1, candidates=32,
-    enough=3e-4, certain=1.6e-4, likely=2.5e-4, shown=False,
+    torsos=2, leg_pairs=2, starts=3, survivors=2, arm_repairs=1, strict=2, single_arms=2, single_legs=1, rounds=1,
+    finalists=1, candidates=32, enough=3e-4, certain=1.6e-4, likely=2.5e-4, shown=False,
 )  # fmt: skip
 HARDER = Effort(
     torsos=14, torso_search=search.TorsoSearch(headings=12, listed=3000, compared=200, climbed=60, steps=480),
