@@ -140,7 +140,7 @@ class Judge:
     """
 
     def __init__(self, hull: Hull, surface: Surface | None = None, others: Sequence[Flesh] = ()) -> None:
-        self.hull, self._surface, self._others = hull, surface, others
+        self._hull, self._surface, self._others = hull, surface, others
         self._last: tuple[FigureState, Judgement] | None = None  # who is asked while searching is published mostly
 
     def judge(self, state: FigureState) -> Judgement:
@@ -148,20 +148,20 @@ class Judge:
         if self._last is None or self._last[0] is not state:
             placed = figure.place(state)
             flesh = placed.flesh()
-            energy = xor_energy(self.hull, placed)
-            self._last = state, Judgement(placed, flesh, energy, *risk_of(self.hull, flesh, energy, *self._say(flesh)))
+            energy = xor_energy(self._hull, placed)
+            self._last = state, Judgement(placed, flesh, energy, *risk_of(self._hull, flesh, energy, *self._say(flesh)))
         return self._last[1]
 
     def risk_worth_a_search(self, state: FigureState) -> float:
         """How likely a figure is wrong although there may be a better one; 0 where nobody would find one."""
-        return 0.0 if self.hull.cut_area_m2 >= CUT_M2 else self.judge(state).risk
+        return 0.0 if self._hull.cut_area_m2 >= CUT_M2 else self.judge(state).risk
 
     def _say(self, flesh: Flesh) -> tuple[Array | None, float]:
         """How much the limbs show, if that is known, and how far outlines pass the figure, m."""
         if self._surface is None:
             return None, 0.0
-        shown = None if self.hull.views is None else limbs_shown(self.hull.views, flesh)
-        return shown, unexplained_m(self.hull, self._surface, flesh, self._others)
+        shown = None if self._hull.views is None else limbs_shown(self._hull.views, flesh)
+        return shown, unexplained_m(self._hull, self._surface, flesh, self._others)
 
 
 class Wariness:

@@ -87,7 +87,7 @@ class Tracker:
     SIZE_WEIGHT, REMEMBERED = 2e-5, 20
     #: Joints go on moving by this share of their last step; what it costs in the final refinement that they do not, and
     #: from which distance on that says that they move otherwise. (All of the step would be less jitter still, but
-    #: carries limbs beyond their places when they stop; four times the weight leaves turning people behind.)
+    #: carries limbs beyond their places when they stop; three times the weight leaves turning people behind.)
     PACE, INERTIA, INERTIA_WIDTH_M = 0.5, 0.03, 0.03
     #: Surface points that a figure is carried along on.
     POINTS = 700

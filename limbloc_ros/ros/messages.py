@@ -152,10 +152,16 @@ def _points(points: Array) -> list[Point]:
 def transform_to_message(T_parent_child: ArrayLike, child: str, header: Header) -> TransformStamped:
     """[4, 4] pose of `child` in the header's frame."""
     T = np.asarray(T_parent_child, dtype=np.float64)
-    x, y, z, w = quaternion(T[:3, :3])
+    return turn_to_message(T[:3, 3].tolist(), quaternion(T[:3, :3]), child, header)
+
+
+def turn_to_message(
+    translation: Sequence[float], turn: Sequence[float], child: str, header: Header
+) -> TransformStamped:
+    """The pose of `child` in the header's frame: m, and a quaternion x, y, z, w."""
     msg = TransformStamped(header=header, child_frame_id=child)
-    msg.transform.translation = Vector3(x=float(T[0, 3]), y=float(T[1, 3]), z=float(T[2, 3]))
-    msg.transform.rotation = Quaternion(x=x, y=y, z=z, w=w)
+    msg.transform.translation = Vector3(**dict(zip("xyz", translation, strict=True)))
+    msg.transform.rotation = Quaternion(**dict(zip("xyzw", turn, strict=True)))
     return msg
 
 

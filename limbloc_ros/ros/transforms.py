@@ -16,14 +16,14 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from geometry_msgs.msg import Quaternion, TransformStamped, Vector3
+from geometry_msgs.msg import TransformStamped
 from numpy.typing import NDArray
 from rclpy.node import Node
 from std_msgs.msg import Header
 
 from limbloc_ros.core.errors import InputError, RigError
 from limbloc_ros.ros import topics
-from limbloc_ros.ros.messages import message_to_transform
+from limbloc_ros.ros.messages import message_to_transform, turn_to_message
 
 Array = NDArray[np.float64]
 
@@ -166,11 +166,9 @@ def link_transforms(urdf: str, angles: Mapping[str, float], header: Header) -> l
     for link in _links(urdf):
         half = 0.0 if link.joint is None else 0.5 * angles[link.joint]
         turn = tuple(math.sin(half) * component for component in link.axis)
-        x, y, z, w = _product(link.rotation, (*turn, math.cos(half)))
-        msg = TransformStamped(header=Header(stamp=header.stamp, frame_id=link.parent), child_frame_id=link.child)
-        msg.transform.translation = Vector3(**dict(zip("xyz", link.translation, strict=True)))
-        msg.transform.rotation = Quaternion(x=x, y=y, z=z, w=w)
-        result.append(msg)
+        rotation = _product(link.rotation, (*turn, math.cos(half)))
+        above = Header(stamp=header.stamp, frame_id=link.parent)
+        result.append(turn_to_message(link.translation, rotation, link.child, above))
     return result
 
 
