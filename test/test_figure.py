@@ -7,6 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from limbloc_ros.core import _figure_topology, figure
+from limbloc_ros.core import _many_parts_kernels as many
+from limbloc_ros.core import _surface_fit_kernels as surface_fit
 from limbloc_ros.core.figure import BONE, SPHERE, FigureState, kernels, part_kernels, place, place_jacobian
 from limbloc_ros.core.pose import JOINT, JOINT_NAMES, STICK_BONES, Flesh
 
@@ -366,6 +368,33 @@ def test_part_distance_against_brute_force(name, order):
         sphere = np.linalg.norm(point - weights @ centres[part]) - weights @ radii[part]
         # (on the part's very axis the root of a difference of products leaves some nanometres)
         assert sphere == pytest.approx(d, abs=2e-8)
+
+
+@pytest.mark.parametrize("name", PARTS)
+@pytest.mark.parametrize("order", [(0, 1, 2), (2, 1, 0), (0, 1, 1), (2, 2, 2)])
+def test_many_pairs_at_once_are_what_each_alone_is(name, order):
+    """Points and rays, with the gate and without: the same to the last bit."""
+    centres, radii = (np.array(x, float) for x in PARTS[name])
+    rng, lanes = np.random.default_rng(5), many.LANES
+    points, normals, rays = rng.normal(size=(3, lanes, 3)) * [[[0.3]], [[1.0]], [[1.0]]]
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    rays[::2] = 0.0
+    rows = np.empty((1, 13))
+    part_kernels.lay_out_part(np.array(order), centres, radii, rows[0])
+    facing = np.array([surface_fit.across(n, ray) for n, ray in zip(normals, rays, strict=True)])
+    kind = int(rows[0, 0] == 3.0)
+    buffers, pairs = np.zeros((2, many.BUFFER)), np.zeros((2, lanes, 2), np.int64)
+    for q in range(lanes):
+        many.put_pair(buffers, pairs, kind, q, points, facing, rays, q, rows, 0)
+    for gate in (0.0, 0.1):
+        best, hints, w = np.full(lanes, 1e9), np.full(lanes, -1), np.empty((lanes, 3))
+        least, way = np.zeros((lanes, 1), np.float32), np.full(1, 0.25, np.float32)
+        many.settle_pairs(buffers, pairs, kind, np.full(2, lanes), gate, best, hints, w, least, way)
+        for q in range(lanes):
+            plain, gated, wb, wc = surface_fit.gated_distance(rows[0], *points[q], rays[q], *facing[q], gate)
+            assert (best[q], hints[q], *w[q]) == (gated, 0, 1.0 - wb - wc, wb, wc)
+            assert least[q, 0] == np.float32(plain) + np.float32(0.25)
 
 
 def test_frustum_worked_by_hand():

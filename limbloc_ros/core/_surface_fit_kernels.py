@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+from limbloc_ros.core._many_parts_kernels import BUFFER, LANES, put_pair, settle_pairs
 from limbloc_ros.core._part_kernels import SLACK, distance_to_part, lay_out
 
 #: A figure that has moved by more than this, m, is looked at anew.
@@ -105,61 +106,94 @@ def nearest_part(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
-def parts_moved(parts: Any, spheres: Any, radii: Any, before: Any, radii_before: Any) -> tuple[Any, float]:
-    """By how much the distance to each part [P] can have changed, m, since its spheres were elsewhere; and the most."""
+def go_on(parts: Any, spheres: Any, radii: Any, spheres_then: Any, radii_then: Any, way: Any) -> float:
+    """Add to `way` [P] by how much the distance to each part can have changed, m, since its spheres were as they were
+    then, which from now on is as they are now. Returns the most that one has changed."""
     by_sphere = np.empty(len(radii))
     for s in range(len(radii)):
-        x, y, z = spheres[s, 0] - before[s, 0], spheres[s, 1] - before[s, 1], spheres[s, 2] - before[s, 2]
-        by_sphere[s] = math.sqrt(x * x + y * y + z * z) + abs(radii[s] - radii_before[s])
-    moved = np.empty(len(parts), np.float32)
+        d2 = 0.0
+        for i in range(3):
+            d2 += (spheres[s, i] - spheres_then[s, i]) ** 2
+            spheres_then[s, i] = spheres[s, i]
+        by_sphere[s] = math.sqrt(d2) + abs(radii[s] - radii_then[s])
+        radii_then[s] = radii[s]
     most = 0.0
     for p in range(len(parts)):
         by = max(by_sphere[parts[p, 0]], by_sphere[parts[p, 1]], by_sphere[parts[p, 2]])
-        moved[p] = by + SLACK
+        way[p] += np.float32(by + SLACK)
         most = max(most, by)
-    return moved, most
+    return most
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
-def explaining_part(
-    point: Any, normal: Any, ray: Any, rows: Any, gate: float, hint: int, least: Any, moved: Any, w: Any
-) -> int:
-    """The part that explains a surface point best, of those that can: as `nearest_part`, by what is known of before.
+def bound_distances(query: Any, rays: Any, bounds: Any, hints: Any, least: Any) -> None:
+    """Write to `least` [Q, P] how near each part is at least, by what `lay_out` puts around it. The one that may be the
+    nearest becomes the hint of a point that has none (-1)."""
+    for q in range(len(query)):
+        x, y, z = query[q, 0], query[q, 1], query[q, 2]
+        rx, ry, rz = rays[q, 0], rays[q, 1], rays[q, 2]
+        for p in range(least.shape[1]):
+            bx, by, bz = bounds[0, p] - x, bounds[1, p] - y, bounds[2, p] - z
+            along = bx * rx + by * ry + bz * rz
+            least[q, p] = np.float32(math.sqrt(max(bx * bx + by * by + bz * bz - along * along, 0.0)) - bounds[3, p])
+        if hints[q] < 0:
+            nearest = 0
+            for p in range(1, least.shape[1]):
+                if least[q, p] < least[q, nearest]:
+                    nearest = p
+            hints[q] = nearest
 
-    `least` [P]: no part was nearer than this then; `moved` [P]: by how much that can have changed. What is learned
-    here is written to `least`.
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def explaining_parts(
+    query: Any, normals: Any, rays: Any, rows: Any, gate: float, hints: Any, least: Any, way: Any
+) -> Any:
+    """Write to `hints` [Q] the part that explains each surface point best, as `nearest_part`; returns weights [Q, 3].
+
+    `least` [Q, P], less the `way` [P] that a part's spheres have gone meanwhile: no part is nearer than that. So most
+    parts are known to be further off than the one that explained the point before. What is learned here is written.
     """
-    x, y, z = point[0], point[1], point[2]
-    nx, ny, nz = across(normal, ray)
-    plain, best, wb, wc = gated_distance(rows[hint], x, y, z, ray, nx, ny, nz, gate)
-    least[hint] = max(least[hint], np.float32(plain) - moved[hint])
-    best_part = hint
-    reach = np.float32(best + SLACK)
-    able = 0
-    for p in range(len(rows)):
-        able += least[p] - moved[p] <= reach
-    if able > 1:
+    count = len(query)
+    w = np.empty((count, 3))
+    best = np.full(count, 1e9)
+    facing = np.empty((count, 3))
+    buffers = np.zeros((2, BUFFER))  # parts of two spheres, parts of three
+    pairs = np.zeros((2, LANES, 2), np.int64)
+    filled = np.zeros(2, np.int64)
+    for q in range(count):
+        along = normals[q, 0] * rays[q, 0] + normals[q, 1] * rays[q, 1] + normals[q, 2] * rays[q, 2]
+        for i in range(3):
+            facing[q, i] = normals[q, i] - along * rays[q, i]
+        kind = int(rows[hints[q], 0] == 3.0)
+        put_pair(buffers, pairs, kind, filled[kind], query, facing, rays, q, rows, hints[q])
+        filled[kind] += 1
+        if filled[kind] == LANES:
+            settle_pairs(buffers, pairs, kind, filled, gate, best, hints, w, least, way)
+    for kind in range(2):
+        settle_pairs(buffers, pairs, kind, filled, gate, best, hints, w, least, way)
+    listed = np.empty(len(rows), np.int64)
+    for q in range(count):
+        reach = np.float32(best[q] + SLACK)
+        able = 0
+        for p in range(len(rows)):  # all at once: without a branch this takes a few nanoseconds
+            able += least[q, p] - way[p] <= reach
+        if able <= 1:  # which is the hint
+            continue
+        hint = hints[q]
+        n = 0
         for p in range(len(rows)):
-            if least[p] - moved[p] <= reach and p != hint:
-                plain, d, b, c = gated_distance(rows[p], x, y, z, ray, nx, ny, nz, gate)
-                least[p] = max(least[p], np.float32(plain) - moved[p])
-                if d < best or (d == best and p < best_part):  # of equals the first, whatever the hint
-                    best, best_part, wb, wc = d, p, b, c
-                    reach = np.float32(best + SLACK)
-    w[0] = 1.0 - wb - wc
-    w[1] = wb
-    w[2] = wc
-    return best_part
-
-
-@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
-def bound_distances(point: Any, ray: Any, bounds: Any, least: Any) -> None:
-    """Write to `least` [P] how near each part is at least: what `lay_out` puts around it."""
-    x, y, z = point[0], point[1], point[2]
-    for p in range(len(least)):
-        bx, by, bz = bounds[0, p] - x, bounds[1, p] - y, bounds[2, p] - z
-        along = bx * ray[0] + by * ray[1] + bz * ray[2]
-        least[p] = np.float32(math.sqrt(max(bx * bx + by * by + bz * bz - along * along, 0.0)) - bounds[3, p])
+            listed[n] = p
+            n += (least[q, p] - way[p] <= reach) & (p != hint)
+        for m in range(n):
+            p = listed[m]
+            kind = int(rows[p, 0] == 3.0)
+            put_pair(buffers, pairs, kind, filled[kind], query, facing, rays, q, rows, p)
+            filled[kind] += 1
+            if filled[kind] == LANES:
+                settle_pairs(buffers, pairs, kind, filled, gate, best, hints, w, least, way)
+    for kind in range(2):
+        settle_pairs(buffers, pairs, kind, filled, gate, best, hints, w, least, way)
+    return w
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
@@ -224,6 +258,7 @@ def surface_term(
     weight_of: Any,
     hints: Any,
     least: Any,
+    way: Any,
     spheres_then: Any,
     radii_then: Any,
     parts: Any,
@@ -238,26 +273,21 @@ def surface_term(
     """Hull surface points to the nearest part: the figure should explain the whole surface (see `nearest_part`).
 
     From step to step figures move by millimetres, and a distance changes by no more than the figure moves. So it is
-    kept how near each part was at least (`least` [Q, P]) when its spheres were at `spheres_then` [S, 3], of radii
-    `radii_then` [S], and which part was the nearest (`hints` [Q]): few others need be asked. All four are written.
+    kept which part was the nearest (`hints` [Q]), how near each part was at least (`least` [Q, P]), and how far it has
+    gone meanwhile (`way` [P]), from `spheres_then` [S, 3] with `radii_then` [S]: few parts need be asked. All five are
+    written.
     """
     rows, bounds = lay_out(parts, spheres, radii)
-    moved, most = parts_moved(parts, spheres, radii, spheres_then, radii_then)
-    anew = not most <= FORGET_M  # also where nothing is known yet
-    if anew:
-        spheres_then[:] = spheres
-        radii_then[:] = radii
-        moved[:] = SLACK
-    w = np.empty(3)
+    most = go_on(parts, spheres, radii, spheres_then, radii_then, way)
+    if not most <= FORGET_M:  # also where nothing is known yet
+        way[:] = 0.0
+        bound_distances(query, rays, bounds, hints, least)
+    weights = explaining_parts(query, normals, rays, rows, gate, hints, least, way)
     away = np.ones(4)
     cost = 0.0
-    p = 0
     for q in range(len(query)):
-        if anew:
-            bound_distances(query[q], rays[q], bounds, least[q])
-        hint = hints[q] if hints[q] >= 0 else p
-        p = explaining_part(query[q], normals[q], rays[q], rows, gate, hint, least[q], moved, w)
-        hints[q] = p
+        p = hints[q]
+        w = weights[q]
         d = offset_from(query[q], rays[q], parts[p], w, spheres, radii, away)
         c, wd = robust_weight(d, width)
         scale = weight_of[q] * (inside_weight if d < 0.0 else 1.0)

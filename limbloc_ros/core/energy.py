@@ -63,13 +63,15 @@ class NearestParts(NamedTuple):
 
     Attributes:
         hints: int64 [Q] the part that explained each point.
-        least: float32 [Q, P] how near, m, each part was at least when the spheres were where they are said to be.
-        spheres: [S, 3] where that was, m.
+        least: float32 [Q, P] how near, m, each part is at least, plus the way it had gone when that was found out.
+        way: float32 [P] the way, m, that the spheres of each part have gone in all.
+        spheres: [S, 3] where they were the last time, m.
         radii: [S] their radii then, m.
     """
 
     hints: NDArray[np.int64]
     least: NDArray[np.float32]
+    way: NDArray[np.float32]
     spheres: Array
     radii: Array
 
@@ -77,7 +79,8 @@ class NearestParts(NamedTuple):
     def unknown(points: int, parts: int, spheres: int) -> NearestParts:
         """Of a figure that was never looked at: it was infinitely far away."""
         far_away = np.full((spheres, 3), np.inf)
-        return NearestParts(np.full(points, -1), np.zeros((points, parts), np.float32), far_away, np.zeros(spheres))
+        least, way = np.zeros((points, parts), np.float32), np.zeros(parts, np.float32)
+        return NearestParts(np.full(points, -1), least, way, far_away, np.zeros(spheres))
 
 
 @dataclass(frozen=True)
