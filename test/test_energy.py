@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from energy_cases import BARE, NOTHING, VOXEL, a_person, entangled, only, ray_distances, size, turned_from_rest
 
-from limbloc_ros.core import energy, figure
+from limbloc_ros.core import energy, figure, lm
 from limbloc_ros.core.energy import Weights
 from limbloc_ros.core.figure import BONE, FigureState, place
 from limbloc_ros.core.hull import Hull
@@ -154,6 +154,52 @@ def test_inclusion_term_worked_by_hand():
         cost, slope = inclusion_cost(x, radius)
         assert cost == 0.0
         assert not slope.any()
+
+
+def bending(values, voxel=0.02):
+    """What a sphere in the middle of a grid of distances adds to its own 4 x 4 block, pushed with force 1."""
+    sdf, block = np.asarray(values, np.float32), np.zeros((12, 12))
+    depth = energy.kernels.sample_sdf(sdf, np.zeros(3), voxel, *[3 * voxel] * 3, np.zeros(3))
+    w = np.array([1.0, 0.0, 0.0])
+    energy.kernels.add_bending(sdf, np.zeros(3), voxel, *[3 * voxel] * 3, depth, w, 1.0 / energy.kernels.STIFFER, block)
+    assert not block[3].any()  # the radius bends nothing
+    assert not block[:, 3:].any()
+    return block[:3, :3]
+
+
+def test_bending_of_the_distance_worked_by_hand():
+    x, y, _ = np.meshgrid(*[0.02 * (np.arange(7) - 3)] * 3, indexing="ij")
+    # between two walls the distance is a V: over 15 mm to both sides it rises by 15 mm each
+    between = bending(np.abs(x) - 0.05)
+    np.testing.assert_allclose(between, np.diag([2 * 0.015 / 0.015**2, 0.0, 0.0]), atol=1e-3)
+    np.testing.assert_allclose(bending(x - 0.05), 0.0, atol=1e-3)  # one wall does not bend it
+    tube = bending(np.hypot(x, y) - 0.05)
+    assert tube[0, 0] > 50.0
+    assert tube[1, 1] == pytest.approx(tube[0, 0])
+    assert abs(tube[2, 2]) < 1e-3  # nothing holds it along the tube
+
+
+def test_bending_makes_no_direction_slippery():
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        bent = bending(0.05 * rng.normal(size=(7, 7, 7)))
+        assert np.linalg.eigvalsh(bent).min() > -1e-9
+
+
+def test_a_figure_thicker_than_the_hull_settles_between_its_walls(case):
+    """Pushed from all sides: without the bending of the distance nearly every second step was sent back."""
+    truth, evidence, _ = case
+    tight = dataclasses.replace(evidence, sdf=evidence.sdf + np.float32(0.02))
+    costs = []
+
+    def evaluate(state):
+        found = energy.system(state, tight, Weights(inclusion=0.02))
+        costs.append(found.cost)
+        return found
+
+    lm.minimise(evaluate, lambda state, step: state.moved(step), truth, iterations=8, tolerance=0.0)
+    least = np.minimum.accumulate(costs)
+    assert (np.array(costs[1:]) < least[:-1]).mean() >= 0.6
 
 
 def test_nothing_sticks_out_of_a_roomy_hull(case):

@@ -77,11 +77,11 @@ class Tracker:
     #: When the cost is so much above the usual one, the figure is first carried on by so many steps, and then all limbs
     #: are checked at once; each time in vain, the wait doubles, up to this, unless the cost rises as much once more.
     #: Then a limb that settles where it was counts as well: it may have come back along a better way.
-    LIMB_DOUBT, MORE_STEPS, LONGEST_DOUBT = 1.25, 10, 8
-    #: The figure is carried along with the firm weights of the search, which lead from further off; so many more steps
-    #: with the final ones put its joints in their places. (With 4, or with limbs checked in every third frame, wrists
-    #: of raised arms stay 10 to 20 cm behind in rough hulls.)
-    FINAL_STEPS = 6
+    LIMB_DOUBT, MORE_STEPS, LONGEST_DOUBT = 1.25, 6, 8
+    #: The figure is carried along by so many steps, or by more when it has moved by 10 cm, with the firm weights of
+    #: the search, which lead from further off; so many more with the final ones put its joints in their places. (With
+    #: limbs checked in every third frame wrists of raised arms stay 10 to 20 cm behind in rough hulls.)
+    STEPS, FAR_STEPS, FINAL_STEPS = 5, 12, 4
     #: People do not change their size, and one hull says little of it: what a deviation of one standard deviation from
     #: the mean shape so far costs (m^2) per frame in that mean, and how many frames count.
     SIZE_WEIGHT, REMEMBERED = 2e-5, 20
@@ -132,7 +132,7 @@ class Tracker:
             systems = [energy.system(guess, evidence, self._firm) for guess in guesses]
             best = min(range(len(guesses)), key=lambda n: systems[n].cost)
             size = KnownSize(self._size, self.SIZE_WEIGHT * min(self._sized, self.REMEMBERED))
-            steps = 8 if np.abs(moved).max() < 0.1 else 20
+            steps = self.STEPS if np.abs(moved).max() < 0.1 else self.FAR_STEPS
             result = refine(guesses[best], evidence, self._firm, steps, (size,), systems[best])
             if not cut:
                 result = self._with_limbs_checked(result, hull, surface, evidence, size)
