@@ -10,18 +10,28 @@ import numpy as np
 from numba import njit
 
 from limbloc_ros.core._block_kernels import block_balls
-from limbloc_ros.core._projection_kernels import UNSEEN, WITHIN, project, row_start, to_pixels, view_of_balls
+from limbloc_ros.core._projection_kernels import (
+    UNSEEN,
+    WITHIN,
+    bend,
+    has_plain_lens,
+    project,
+    row_start,
+    to_pixels,
+    view_of_balls,
+)
 
 #: Edge of the blocks that are evaluated, in voxels, and how many voxels they have.
 LEAF, VOXELS = 4, 64
 # Rows of the arrays of a leaf's voxels: flat, with lengths that the compiler knows, so that it sees that rows do not
-# overlap and makes vector code. Seen by one camera: the pixel (later its fraction), m per px, the pixels around it, and
-# the distance, m.
-U, V, SCALE, TOP, TOP_RIGHT, BELOW, BELOW_RIGHT, DISTANCE = (row * VOXELS for row in range(8))
+# overlap and makes vector code. Seen by one camera: the pixel (later its fraction), m per px, and the distance, m.
+U, V, SCALE, DISTANCE = (row * VOXELS for row in range(4))
+# The pixels around it.
+TOP, TOP_RIGHT, BELOW, BELOW_RIGHT = (row * VOXELS for row in range(4))
 # Of the cameras so far: the largest and the second largest distance, and the camera of the largest.
 FIRST, SECOND, WHO = (row * VOXELS for row in range(3))
 
-#: A bilinear value is at most this far (px) below the value at the nearest pixel to a point: the point's distance to
+#: A bilinear value differs at most so far (px) from the value at the nearest pixel to a point: the point's distance to
 #: that pixel (0.71), the mean distance of the four pixels to the point (0.71), and the step at the outline (0.42).
 SLACK_PX = 2.0
 
@@ -72,12 +82,14 @@ def look_at_blocks(
     keep_second: bool,
     min_seen: int,
     outward: Any,
+    most: Any,
     whole: Any,
 ) -> Any:
     """Which leaves may hold a wanted voxel, bool [B]; closer than `_block_kernels.near_blocks`, from the distances.
 
     Fills `outward` [C, B] with how far (px) each camera sees a leaf's centre outside, roughly (-inf if some voxel may
-    not be seen), and `whole` [C, B]: whether it sees all of it.
+    not be seen), `most` [C, B] with what (m) no distance of its voxels exceeds, and `whole` [C, B]: whether the camera
+    sees all of it.
     """
     centres, radius = block_balls(blocks, LEAF, voxel)
     views = np.empty((5, len(blocks)))
@@ -86,7 +98,7 @@ def look_at_blocks(
         x0, y0, width, height, offset = boxes[c, 0], boxes[c, 1], boxes[c, 2], boxes[c, 3], boxes[c, 4]
         view_of_balls(cams, c, centres, radius, len(blocks), views)
         for n in range(len(blocks)):
-            outward[c, n] = -math.inf
+            outward[c, n], most[c, n] = -math.inf, math.inf
             whole[c, n] = views[4, n] == WITHIN
             tallies[2, n] += views[4, n] == UNSEEN
             if not whole[c, n]:
@@ -99,6 +111,8 @@ def look_at_blocks(
             else:
                 outward[c, n] = field[offset + int(py + 0.5) * width + int(px + 0.5)]
                 away = outward[c, n] - SLACK_PX - reach
+                furthest = outward[c, n] + SLACK_PX + reach
+                most[c, n] = furthest * (near if furthest < 0.0 else near + 2.0 * radius) / cams[c, 12]
             tallies[0, n] += away > 0.0
             tallies[1, n] += away > 0.0 and away * near / cams[c, 12] >= band
     outside = (tallies[1] > 0) & ((tallies[0] > 1) | (not keep_second))
@@ -132,18 +146,28 @@ def project_leaf(cams: Any, c: int, x: float, y: float, z: float, steps: Any, se
         seen[U + m] = (a + steps[m]) * inverse
         seen[V + m] = (b + steps[VOXELS + m]) * inverse
         seen[SCALE + m] = depth * scale if depth > 1e-6 else 0.0
-    to_pixels(cams, c, seen[: 3 * VOXELS].reshape(3, VOXELS))
+    if not has_plain_lens(cams, c):
+        to_pixels(cams, c, seen[: 3 * VOXELS].reshape(3, VOXELS))
+        return
+    k1, k2, p1, p2, k3 = cams[c, 17], cams[c, 18], cams[c, 19], cams[c, 20], cams[c, 21]
+    fx, fy, cx, cy = cams[c, 12], cams[c, 13], cams[c, 14], cams[c, 15]
+    limit = cams[c, 33]
+    for m in range(VOXELS):  # what `to_pixels` does, for as many as the compiler knows: in two thirds of the time
+        scale = seen[SCALE + m]
+        seen[U + m], seen[V + m], r2 = bend(seen[U + m], seen[V + m], fx, fy, cx, cy, k1, k2, p1, p2, k3)
+        seen[SCALE + m] = 0.0 if r2 > limit else scale
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
-def read_leaf(field: Any, boxes: Any, c: int, seen: Any, at: Any) -> None:
+def read_leaf(field: Any, boxes: Any, c: int, seen: Any, at: Any, around: Any) -> None:
     """Distances (m) of a leaf's voxels to camera c's silhouette, to row DISTANCE of `seen`; the camera sees them all.
 
-    What lies beyond the stored piece reads its border, where all that matters is further outside than the band.
+    What lies beyond the stored piece reads its border, where all that matters is further outside than the band. The
+    pixels are moved without a change to `around`: one by one, for no two lie side by side, and made double together.
     """
     x0, y0, width, height, offset = boxes[c, 0], boxes[c, 1], boxes[c, 2], boxes[c, 3], boxes[c, 4]
     right, bottom = float(width - 1), float(height - 1)
-    last_x, last_y, stride = np.int32(width - 2), np.int32(height - 2), np.int32(width)
+    last_x, last_y, stride, first = np.int32(width - 2), np.int32(height - 2), np.int32(width), np.int32(offset)
     for m in range(VOXELS):
         px = min(max(seen[U + m] - x0, 0.0), right)
         py = min(max(seen[V + m] - y0, 0.0), bottom)
@@ -151,18 +175,20 @@ def read_leaf(field: Any, boxes: Any, c: int, seen: Any, at: Any) -> None:
         iy = min(np.int32(py), last_y)
         seen[U + m] = px - ix
         seen[V + m] = py - iy
-        at[m] = iy * stride + ix
-    piece = field[offset : offset + width * height]
+        at[m] = np.int32(iy * stride + ix) + first
+    next_row = np.uint64(width)  # unsigned: numba need not ask whether to count from the end
     for m in range(VOXELS):
-        top = np.uint64(at[m])  # unsigned: numba need not ask whether to count from the end
-        below = top + np.uint64(width)
-        seen[TOP + m] = piece[top]
-        seen[TOP_RIGHT + m] = piece[top + np.uint64(1)]
-        seen[BELOW + m] = piece[below]
-        seen[BELOW_RIGHT + m] = piece[below + np.uint64(1)]
+        top = np.uint64(at[m])
+        below = top + next_row
+        around[TOP + m] = field[top]
+        around[TOP_RIGHT + m] = field[top + np.uint64(1)]
+        around[BELOW + m] = field[below]
+        around[BELOW_RIGHT + m] = field[below + np.uint64(1)]
     for m in range(VOXELS):
-        top = seen[TOP + m] + seen[U + m] * (seen[TOP_RIGHT + m] - seen[TOP + m])
-        below = seen[BELOW + m] + seen[U + m] * (seen[BELOW_RIGHT + m] - seen[BELOW + m])
+        left, right = np.float64(around[TOP + m]), np.float64(around[TOP_RIGHT + m])
+        top = left + seen[U + m] * (right - left)
+        left, right = np.float64(around[BELOW + m]), np.float64(around[BELOW_RIGHT + m])
+        below = left + seen[U + m] * (right - left)
         seen[DISTANCE + m] = (top + seen[V + m] * (below - top)) * seen[SCALE + m]
 
 
@@ -200,12 +226,15 @@ def rank_leaf(seen: Any, c: int, state: Any) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
-def wanted_in_leaf(state: Any, band: float, second_below: float) -> Any:
-    """How many voxels are still wanted after the cameras so far."""
-    wanted: Any = 0
+def some_to_change(state: Any, band: float, second_below: float, most: float) -> bool:
+    """Whether a camera whose distances do not exceed `most` may change a voxel that is still wanted: whether it may be
+    among the two largest there."""
+    some: Any = np.int64(0)
     for m in range(VOXELS):
-        wanted += np.int64((state[FIRST + m] < band) | (state[SECOND + m] < second_below))
-    return wanted
+        second = state[SECOND + m]
+        some |= np.int64(((state[FIRST + m] < band) | (second < second_below)) & (second <= most))
+    found: bool = some > 0
+    return found
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
@@ -226,20 +255,26 @@ def evaluate_blocks(
     the voxels below `upper` (lattice, exclusive).
     """
     outward = np.empty((len(cams), len(blocks)))
+    most = np.empty((len(cams), len(blocks)))
     whole = np.empty((len(cams), len(blocks)), np.bool_)
-    kept = look_at_blocks(blocks, cams, boxes, field, voxel, band, keep_second, min_seen, outward, whole)
+    kept = look_at_blocks(blocks, cams, boxes, field, voxel, band, keep_second, min_seen, outward, most, whole)
     room = np.count_nonzero(kept) * VOXELS
     index = np.empty((room, 3), np.int32)
     first = np.empty(room, np.float32)
     second = np.empty(room, np.float32)
     who = np.empty(room, np.int16)
-    count = 0
+    count = np.uint64(0)  # unsigned: numba need not ask whether to count from the end
+    end_i, end_j, end_k = upper[0], upper[1], upper[2]
     second_below = 0.0 if keep_second else -math.inf
     steps = leaf_steps(cams, voxel)
-    seen = np.empty(8 * VOXELS)
+    seen = np.empty(4 * VOXELS)
+    around = np.empty(4 * VOXELS, np.float32)
     state = np.empty(3 * VOXELS)
     at = np.empty(VOXELS, np.int32)
     unseen = np.empty(VOXELS, np.int64)
+    wanted = np.empty(VOXELS, np.uint8)
+    largest = np.empty(2 * VOXELS, np.float32)
+    camera = np.empty(VOXELS, np.int16)
     order = np.empty(len(cams), np.int64)
     for n in np.flatnonzero(kept):
         bi, bj, bk = blocks[n, 0], blocks[n, 1], blocks[n, 2]
@@ -254,25 +289,35 @@ def evaluate_blocks(
         unseen[:] = 0
         for turn in range(len(cams)):
             c = order[turn]
+            if turn > 0 and whole[c, n] and not some_to_change(state, band, second_below, most[c, n]):
+                continue
             project_leaf(cams, c, (bi + 0.5) * voxel, (bj + 0.5) * voxel, (bk + 0.5) * voxel, steps[c], seen)
             if whole[c, n]:
-                read_leaf(field, boxes, c, seen, at)
+                read_leaf(field, boxes, c, seen, at, around)
             else:
                 read_voxels(field, boxes, cams, c, seen, band, unseen)
             rank_leaf(seen, c, state)
-            if turn < 3 and wanted_in_leaf(state, band, second_below) == 0:
-                break
+        found = 0
         for m in range(VOXELS):
-            if not (state[FIRST + m] < band or state[SECOND + m] < second_below) or len(cams) - unseen[m] < min_seen:
-                continue
             i, j, k = bi + m // (LEAF * LEAF), bj + m // LEAF % LEAF, bk + m % LEAF
-            if i >= upper[0] or j >= upper[1] or k >= upper[2]:
-                continue
-            index[count, 0], index[count, 1], index[count, 2] = i, j, k
-            first[count] = min(state[FIRST + m], band)
-            second[count] = state[SECOND + m]
-            who[count] = np.int16(state[WHO + m])
-            count += 1
+            some = (state[FIRST + m] < band) | (state[SECOND + m] < second_below)
+            some &= (i < end_i) & (j < end_j) & (k < end_k) & (len(cams) - unseen[m] >= min_seen)
+            wanted[m] = some
+            found += some
+            largest[FIRST + m] = min(state[FIRST + m], band)
+            largest[SECOND + m] = state[SECOND + m]
+            camera[m] = np.int16(state[WHO + m])
+        if found == 0:
+            continue
+        # Which are wanted is nearly random: each is written, without a branch, and the next one over it if it is not.
+        for m in range(VOXELS):
+            index[count, 0] = bi + m // (LEAF * LEAF)
+            index[count, 1] = bj + m // LEAF % LEAF
+            index[count, 2] = bk + m % LEAF
+            first[count] = largest[FIRST + m]
+            second[count] = largest[SECOND + m]
+            who[count] = camera[m]
+            count += np.uint64(wanted[m])
     return index[:count], first[:count], second[:count], who[:count]
 
 

@@ -140,6 +140,32 @@ def project_block(cams: Any, c: int, points: Any, seen: Any) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def has_plain_lens(cams: Any, c: int) -> bool:
+    """Whether a polynomial of five coefficients describes the lens, as of most it does."""
+    some = False
+    for column in range(22, 29):
+        some |= cams[c, column] != 0.0
+    plain: bool = cams[c, 16] == POLYNOMIAL and not some
+    return plain
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def bend(
+    a: float, b: float, fx: float, fy: float, cx: float, cy: float,
+    k1: float, k2: float, p1: float, p2: float, k3: float,
+) -> tuple[float, float, float]:  # fmt: skip
+    """Normalised coordinates -> pixel, and their square, of a plain lens (see `has_plain_lens`).
+
+    The same numbers as `distort` without their zeros, above all without a division by 1: twice as fast.
+    """
+    r2 = a * a + b * b
+    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    u = fx * (a * radial + 2.0 * p1 * a * b + p2 * (r2 + 2.0 * a * a)) + cx
+    v = fy * (b * radial + p1 * (r2 + 2.0 * b * b) + 2.0 * p2 * a * b) + cy
+    return u, v, r2
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def to_pixels(cams: Any, c: int, seen: Any) -> None:
     """Normalised coordinates (rows 0 and 1 of `seen`) -> pixels; row 2 becomes 0 beyond the lens's range."""
     fx, fy, cx, cy = cams[c, 12], cams[c, 13], cams[c, 14], cams[c, 15]
@@ -156,16 +182,10 @@ def to_pixels(cams: Any, c: int, seen: Any) -> None:
         k1, k2, p1, p2, k3 = cams[c, 17], cams[c, 18], cams[c, 19], cams[c, 20], cams[c, 21]
         k4, k5, k6 = cams[c, 22], cams[c, 23], cams[c, 24]
         s1, s2, s3, s4 = cams[c, 25], cams[c, 26], cams[c, 27], cams[c, 28]
-        if k4 == k5 == k6 == s1 == s2 == s3 == s4 == 0.0:
-            # Most lenses: the same numbers without their zeros, above all without a division by 1. Twice as fast.
+        if has_plain_lens(cams, c):
             for m in range(seen.shape[1]):
-                a = seen[0, m]
-                b = seen[1, m]
                 scale = seen[2, m]
-                r2 = a * a + b * b
-                radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-                seen[0, m] = fx * (a * radial + 2.0 * p1 * a * b + p2 * (r2 + 2.0 * a * a)) + cx
-                seen[1, m] = fy * (b * radial + p1 * (r2 + 2.0 * b * b) + 2.0 * p2 * a * b) + cy
+                seen[0, m], seen[1, m], r2 = bend(seen[0, m], seen[1, m], fx, fy, cx, cy, k1, k2, p1, p2, k3)
                 seen[2, m] = 0.0 if r2 > limit else scale
             return
         for m in range(seen.shape[1]):

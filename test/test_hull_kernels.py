@@ -1,0 +1,34 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the hull's kernels leave out: cameras that cannot decide."""
+
+import numpy as np
+import pytest
+from camera_rings import LENSES, ball_masks, measured, ring
+
+from limbloc_ros.core import _hull_kernels as kernels
+from limbloc_ros.core._hull_kernels import LEAF
+from limbloc_ros.core.config import HullConfig
+from limbloc_ros.core.silhouettes import min_seen
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_no_distance_in_a_block_exceeds_its_bound(lens):
+    rig = ring(5, lens=lens)
+    config = HullConfig(voxel_m=0.03)
+    balls = measured(rig, ball_masks(rig, [((0.1, 0.0, 1.0), 0.3), ((-0.2, 0.2, 0.6), 0.15)]), config)
+    blocks, cams, boxes, field = balls.blocks, balls.cameras, balls.boxes, balls.field
+    outward, most = np.empty((2, 5, len(blocks)))
+    whole = np.empty((5, len(blocks)), np.bool_)
+    seen = min_seen(5)
+    kernels.look_at_blocks(blocks, cams, boxes, field, 0.03, config.band_m, True, seen, outward, most, whole)
+    bounded = np.isfinite(most)
+    assert bounded.any() and not (bounded & ~whole).any()
+    steps = np.stack(np.meshgrid(*[np.arange(LEAF)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    slack = []
+    for c, n in zip(*np.nonzero(bounded), strict=True):
+        for x, y, z in (blocks[n] + steps + 0.5) * 0.03:
+            start = kernels.row_start(cams, c, x, y)
+            distance = kernels.camera_distance(cams, c, boxes, field, config.band_m, start, z)
+            slack.append(most[c, n] - distance)
+    assert min(slack) >= 0.0
+    assert min(slack) < 0.3  # pixels of 4 cm, of which some lenses make 10: it is no idle bound
