@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the hull's kernels leave out: cameras that cannot decide."""
+"""What the hull's kernels leave out: cameras that cannot decide, blocks that are known."""
 
 import numpy as np
 import pytest
 from camera_rings import LENSES, ball_masks, measured, ring
 
+from limbloc_ros.core import _block_kernels as near
 from limbloc_ros.core import _hull_kernels as kernels
 from limbloc_ros.core._hull_kernels import LEAF
 from limbloc_ros.core.config import HullConfig
@@ -32,3 +33,11 @@ def test_no_distance_in_a_block_exceeds_its_bound(lens):
             slack.append(most[c, n] - distance)
     assert min(slack) >= 0.0
     assert min(slack) < 0.3  # pixels of 4 cm, of which some lenses make 10: it is no idle bound
+
+
+def test_known_blocks_are_not_found_again():
+    lower, upper = np.array([-7, 3, 0]), np.array([30, 44, 37])
+    blocks = near.root_blocks(lower, upper, LEAF)
+    known = blocks[np.random.default_rng(3).random(len(blocks)) < 0.4]
+    new = blocks[near.not_among(blocks, known, lower, upper, LEAF)]
+    assert {*map(tuple, new.tolist())} == {*map(tuple, blocks.tolist())} - {*map(tuple, known.tolist())}

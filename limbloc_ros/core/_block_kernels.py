@@ -129,12 +129,27 @@ def pick_blocks(blocks: Any, kept: Any) -> Any:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def not_among(blocks: Any, known: Any, lower: Any, upper: Any, size: int) -> Any:
+    """Which blocks [B, 3] of `size` voxels of a box of the lattice are none of the known ones [K, 3]; bool [B]."""
+    ni, nj, nk = (upper - lower + size - 1) // size
+    new = np.ones((ni, nj, nk), np.bool_)
+    for n in range(len(known)):
+        i, j, k = known[n, 0] - lower[0], known[n, 1] - lower[1], known[n, 2] - lower[2]
+        new[i // size, j // size, k // size] = False
+    out = np.empty(len(blocks), np.bool_)
+    for n in range(len(blocks)):
+        i, j, k = blocks[n, 0] - lower[0], blocks[n, 1] - lower[1], blocks[n, 2] - lower[2]
+        out[n] = new[i // size, j // size, k // size]
+    return out
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def find_blocks(
     lower: Any, upper: Any, root: int, leaf: int, voxel: float, cams: Any, frames: Any, sums: Any, band: float,
-    min_seen: int, gained: Any,
+    min_seen: int, gained: Any, known: Any,
 ) -> Any:  # fmt: skip
     """The blocks of `leaf` voxels [B, 3] in a box of the lattice (`upper` exclusive) that may hold a wanted voxel (see
-    `near_blocks`), found by halving blocks of `root` voxels.
+    `near_blocks`), found by halving blocks of `root` voxels; but for those that are known already [K, 3].
 
     `gained` is `frames` and `sums` of other pixels: only blocks that may lie within the band of these are wanted. If it
     has no frames, all are.
@@ -144,6 +159,8 @@ def find_blocks(
     while True:
         if len(gained[0]) > 0:
             blocks = pick_blocks(blocks, blocks_beside(blocks, size, voxel, cams, gained[0], gained[1], band))
+        if size == leaf and len(known) > 0:
+            blocks = pick_blocks(blocks, not_among(blocks, known, lower, upper, size))
         blocks = pick_blocks(blocks, near_blocks(blocks, size, voxel, cams, frames, sums, band, min_seen))
         if size == leaf:
             return blocks

@@ -445,18 +445,19 @@ def _new_blocks(whole: Silhouettes, old: Silhouettes | None) -> NDArray[np.int32
     """The blocks of LEAF voxels [B, 3] that can hold voxels that matter, but those that `old` has, which remain.
 
     Found by halving blocks that may hold some, which the masks alone tell. Only beside the foreground that was gained
-    since then there can be more than `old` has.
+    since then there can be more than `old` has; and what it has could hold some then, for masks only grow.
     """
     gained = whole.gained_since(old) if old is not None and len(old.blocks) else _NONE
+    known = whole.blocks[:0] if old is None or gained is _NONE else old.blocks
     seen, band_m = min_seen(len(whole.names)), whole.band_m
     table = (whole.voxel_m, whole.cameras)
     low, high = whole.lattice
     blocks: NDArray[np.int32] = near.find_blocks(
         low, high, ROOT, LEAF, *table, whole.counts.frames, whole.counts.sums, band_m, seen,
-        (gained.frames, gained.sums),
+        (gained.frames, gained.sums), known,
     )  # fmt: skip
     if old is None or gained is _NONE:
         return blocks
-    known = near.near_blocks(blocks, LEAF, *table, old.counts.frames, old.counts.sums, band_m, seen)
-    new: NDArray[np.int32] = blocks[~known]
+    before = near.near_blocks(blocks, LEAF, *table, old.counts.frames, old.counts.sums, band_m, seen)
+    new: NDArray[np.int32] = blocks[~before]
     return new
