@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+from limbloc_ros.core import _surface_kernels as kernels
 from limbloc_ros.core.errors import InputError
 from limbloc_ros.core.hull import Hull
 from limbloc_ros.core.surface import curvature_variability, extract_surface
@@ -169,3 +170,15 @@ def test_variability_is_high_where_curvature_changes():
 def test_empty_hull_is_refused():
     with pytest.raises(InputError, match="got an empty one"):
         extract_surface(Hull(VOXEL, (0, 0, 0), np.full((4, 4, 4), 0.06, np.float32), 0.06, (), {}))
+
+
+@pytest.mark.parametrize("density", [0.05, 0.2, 0.5])
+def test_pieces_are_those_that_scipy_finds(density):
+    cells = np.random.default_rng(5).random((9, 14, 11)) < density
+    local = np.argwhere(cells).astype(np.int32)
+    number = np.full(cells.shape, -1, np.int32)
+    number[cells] = np.arange(len(local))
+    piece = kernels.label_pieces(local, number, kernels.OFFSETS)
+    labels, count = ndimage.label(cells, np.ones((3, 3, 3)))
+    assert count > 1 or density == 0.5
+    np.testing.assert_array_equal(piece, labels[cells] - 1)  # both count in the order of the first cells

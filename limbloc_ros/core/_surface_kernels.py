@@ -9,6 +9,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from limbloc_ros.core._union_kernels import join, root
+
 Array = NDArray[np.float64]
 Ints = NDArray[np.int32]
 
@@ -74,28 +76,22 @@ def list_neighbours(indices: Ints, offsets: Ints) -> Ints:
 @njit(cache=True, nogil=True)
 def label_pieces(local: Ints, number: Ints, offsets: Ints) -> Ints:
     """[M] which connected piece each of the listed voxels [M, 3] belongs to, counted from 0 on."""
-    nx, ny, nz = number.shape
-    label = np.full(len(local), -1, dtype=np.int32)
-    stack = np.empty(len(local), dtype=np.int32)
+    _, ny, nz = number.shape
+    parent = np.arange(len(local), dtype=np.int32)
+    before = offsets[: len(offsets) // 2]  # the other half looks back at this one
+    for n in range(len(local)):
+        for m in range(len(before)):
+            i, j, k = local[n, 0] + before[m, 0], local[n, 1] + before[m, 1], local[n, 2] + before[m, 2]
+            if i >= 0 and 0 <= j < ny and 0 <= k < nz and number[i, j, k] >= 0:
+                join(parent, number[i, j, k], n)
+    label = np.empty(len(local), dtype=np.int32)
     labels = 0
-    for start in range(len(local)):
-        if label[start] >= 0:
-            continue
-        label[start] = labels
-        stack[0] = start
-        top = 1
-        while top > 0:
-            top -= 1
-            n = stack[top]
-            for m in range(len(offsets)):
-                i, j, k = local[n, 0] + offsets[m, 0], local[n, 1] + offsets[m, 1], local[n, 2] + offsets[m, 2]
-                if 0 <= i < nx and 0 <= j < ny and 0 <= k < nz:
-                    other = number[i, j, k]
-                    if other >= 0 and label[other] < 0:
-                        label[other] = labels
-                        stack[top] = other
-                        top += 1
-        labels += 1
+    for n in range(len(local)):
+        first = root(parent, n)
+        if first == n:
+            label[n] = labels
+            labels += 1
+        label[n] = label[first]
     return label
 
 

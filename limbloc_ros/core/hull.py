@@ -97,7 +97,8 @@ class Hull:
         """
         faces = 0
         for axis in range(3):
-            first, second, before, last = (np.take(self.sdf, i, axis=axis) for i in (0, 1, -2, -1))
+            layers = np.moveaxis(self.sdf, axis, 0)  # no copies
+            first, second, before, last = layers[0], layers[1], layers[-2], layers[-1]
             faces += int(np.count_nonzero((before < 0) & (last >= self.band_m)))
             if axis < 2 or self.origin_m[2] > FLOOR_M:  # people stand and lie on the floor
                 faces += int(np.count_nonzero((second < 0) & (first >= self.band_m)))
