@@ -159,7 +159,11 @@ def _check_size(width: int, height: int, what: str) -> None:
 
 def compressed_to_pixels(msg: CompressedPicture) -> Pixels:
     """A compressed image -> pixels, as `decode_picture`."""
-    return decode_picture(msg.data if isinstance(msg.data, bytes) else msg.data.tobytes(), msg.format)
+    return decode_picture(_bytes_of(msg), msg.format)
+
+
+def _bytes_of(msg: CompressedPicture) -> bytes:
+    return msg.data if isinstance(msg.data, bytes) else msg.data.tobytes()
 
 
 def decode_picture(data: bytes, claimed: str = "") -> Pixels:
@@ -232,6 +236,12 @@ def message_to_mask(msg: RawImage | CompressedPicture) -> Pixels:
     Raises:
         InputError: not a single channel of 8 bits, or what `image_to_pixels` and `compressed_to_pixels` refuse.
     """
+    if not hasattr(msg, "encoding"):
+        data = _bytes_of(msg)
+        _check_compressed(data, msg.format)
+        mask = decode_mask(data)
+        if mask is not None:  # as nearly all are: 0 and 255 already
+            return mask
     pixels = message_to_pixels(msg)
     if pixels.ndim != 2:
         raise InputError(f"expected a mask of one channel (mono8), got {pixels.shape[2]} channels")

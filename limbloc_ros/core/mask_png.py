@@ -62,4 +62,5 @@ def decode_mask(data: bytes) -> Bytes | None:
     rows = np.frombuffer(unpacked, dtype=np.uint8).reshape(shape)
     if rows[:, 0].any():  # rows that are told as differences
         return None
-    return np.unpackbits(rows[:, 1:], axis=1, count=width) * np.uint8(255)
+    mask = np.unpackbits(rows[:, 1:], axis=1, count=width)
+    return np.negative(mask, out=mask)  # of 1 that is 255
