@@ -82,6 +82,13 @@ def test_depth_is_trilinear_and_constant_beyond_the_grid():
         assert value == pytest.approx(a * at[0] + b * at[1] + c * at[2] + d, abs=1e-5)
     assert kernels.depth_at(sdf, origin, voxel, -90.0, -2.0, 3.0) == pytest.approx(d, abs=1e-6)
     assert kernels.depth_at(sdf, origin, voxel, 90.0, -2.0, 3.0) == pytest.approx(3 * a + d, abs=0.002 * abs(a))
+    sdf = rng.normal(size=(4, 5, 6)).astype(np.float32)
+    points = origin + voxel * rng.uniform(-2.0, 7.0, (kernels.CHUNK, 3))
+    work, cells, corners = kernels.chunk_scratch()
+    work[: points.size] = points.T.ravel()
+    kernels.depths_at(sdf, origin, voxel, work, cells, corners)
+    one_by_one = [kernels.depth_at(sdf, origin, voxel, *point) for point in points]
+    assert work[points.size : points.size + kernels.CHUNK].tolist() == pytest.approx(one_by_one, abs=1e-12)
 
 
 # small kernels by brute force
@@ -170,6 +177,15 @@ def tube_by_hand(depth, a, b, ra, rb, steps, clip, skip):
     return (np.clip(np.where(miss > 0, 2 * thin, miss), -clip, 2 * clip) ** 2).mean() / clip**2
 
 
+def tube_scores(grid, start, ends, ra, rb, steps, clip, skip):
+    """What `score_tubes` says of cones from one point to several."""
+    ways = np.zeros((7, len(ends) + kernels.CHUNK))
+    ways[3:6, : len(ends)] = np.transpose(ends)
+    scratch = kernels.chunk_scratch()
+    limb_kernels.score_tubes(*grid, np.array(start), ra, rb, steps, clip, skip, ways, len(ends), scratch)
+    return ways[6, : len(ends)]
+
+
 def test_score_of_a_tube_against_numpy():
     rng = np.random.default_rng(9)
     radius = 0.06
@@ -180,21 +196,15 @@ def test_score_of_a_tube_against_numpy():
         return kernels.depth_at(*grid, *point)
 
     seen = []
-    for n in range(300):
-        a, b = rng.uniform(-0.25, 0.25, (2, 3)) * [0.3, 0.3, 1.0]
+    for n in range(60):
+        count = 1 + 7 * n
+        start, ends = rng.uniform(-0.25, 0.25, 3), rng.uniform(-0.25, 0.25, (count, 3)) * [0.3, 0.3, 1.0]
         ra, rb, clip, skip = rng.uniform([0.02, 0.02, 0.02, 0.0], [0.1, 0.1, 0.06, 0.5])
         steps = 4 + n % 5
-        expected = tube_by_hand(depth, a, b, ra, rb, steps, clip, skip)
-        score = limb_kernels.tube_score(*grid, *a, *b, ra, rb, steps, clip, skip, 1e9)
-        assert score == pytest.approx(expected, rel=1e-9, abs=1e-12)
-        seen.append(score)
-        # whoever has lost already is not measured to the end
-        for most in (0.5 * expected, 1.0001 * expected + 1e-9):
-            early = limb_kernels.tube_score(*grid, *a, *b, ra, rb, steps, clip, skip, most)
-            if expected > most:
-                assert most < early <= score
-            else:
-                assert early == score
+        expected = [tube_by_hand(depth, start, end, ra, rb, steps, clip, skip) for end in ends]
+        scores = tube_scores(grid, start, ends, ra, rb, steps, clip, skip)
+        np.testing.assert_allclose(scores, expected, rtol=1e-9, atol=1e-12)
+        seen += expected
     assert min(seen) < 0.1
     assert max(seen) > 3.5
 
@@ -203,8 +213,8 @@ def test_a_tube_may_be_thinner_but_not_thicker_than_expected():
     hull = hull_where(lambda p: np.hypot(p[:, 0] - 0.01, p[:, 1] - 0.01) - 0.05, [-0.3] * 3, [0.3] * 3)
 
     def score(radius, x=0.01):
-        ends = (x, 0.01, -0.2, x, 0.01, 0.2)
-        return limb_kernels.tube_score(hull.sdf, hull.origin_m, VOXEL, *ends, radius, radius, 6, 0.04, 0.0, 1e9)
+        grid = (hull.sdf, hull.origin_m, VOXEL)
+        return tube_scores(grid, (x, 0.01, -0.2), [(x, 0.01, 0.2)], radius, radius, 6, 0.04, 0.0)[0]
 
     assert score(0.05) == pytest.approx(0.0, abs=1e-6)
     eaten = 0.05 / (1 - limb_kernels.EATEN)  # so thick was the limb of which the masks left 5 cm
@@ -244,7 +254,84 @@ def test_explained_volume_worked_by_hand():
     cells = hull.origin_m + 2 * VOXEL * np.indices(grid.shape).reshape(3, -1).T
     depth = 0.1 - np.linalg.norm(cells - 0.01, axis=1)
     np.testing.assert_allclose(grid.ravel(), np.clip(depth / 0.05, 0, 1), atol=1e-6)
-    inside = limb_kernels.explained_fraction(grid, hull.origin_m, 2 * VOXEL, 0.0, 0.0, 0.0, 0.02, 0.0, 0.0, 0.0)
-    assert inside == pytest.approx(1.0)
-    outside = limb_kernels.explained_fraction(grid, hull.origin_m, 2 * VOXEL, 0.5, 0.5, 0.5, 0.9, 0.5, 0.5, 0.0)
-    assert outside == 0.0
+    ways = np.zeros((7, kernels.CHUNK))
+    ways[3:6, :2] = np.array([[0.02, 0.0, 0.0], [0.9, 0.0, 0.0]]).T
+    ways[6] = 0.5
+    cells = np.zeros(3 * kernels.CHUNK, np.int32)
+    limb_kernels.add_explained(grid, hull.origin_m, 2 * VOXEL, np.zeros(3), 0.0, 2.0, ways, 2, cells)
+    assert ways[6, 0] == pytest.approx(0.5 + 2.0)
+    assert ways[6, 1] == pytest.approx(0.5)  # from 11 cm on: where nothing is explained, and beyond the grid
+
+
+def test_ways_from_a_point_against_numpy():
+    rng = np.random.default_rng(12)
+    for count in (0, 1, 63, 64, 65, 300):
+        points, uniform = rng.uniform(-1, 1, (count, 3)), sphere_directions(70)
+        start, cone = rng.uniform(-0.1, 0.1, 3), np.append(uniform[5], 0.6)
+        away = points - start
+        far = np.linalg.norm(away, axis=1)
+        near = away[(far >= 0.85 * 0.7) & (far <= 1.15 * 0.7)]
+        expected = np.vstack([near / np.linalg.norm(near, axis=1, keepdims=True), uniform])
+        expected = expected[expected @ cone[:3] <= cone[3]]
+        ways, work = np.zeros((7, 500)), kernels.chunk_scratch()[0]
+        found = limb_kernels.ways_from(
+            start, 0.7, cone, np.ascontiguousarray(points.T), np.ascontiguousarray(uniform.T), ways, work
+        )
+        assert found == len(expected)
+        np.testing.assert_allclose(ways[:3, :found].T, expected, atol=1e-12)
+        np.testing.assert_allclose(ways[3:6, :found].T, start + 0.7 * expected, atol=1e-12)
+
+
+def test_rows_leave_a_heap_in_order_of_their_scores():
+    rng = np.random.default_rng(13)
+    scores = rng.integers(0, 40, 200) / 8  # many are equal: the first comes first
+    heap, order = np.zeros(200, np.int64), rng.permutation(200)
+    for count, row in enumerate(order):
+        limb_kernels.push(heap, count, scores, row)
+    left = [limb_kernels.pop(heap, count, scores) for count in range(200, 0, -1)]
+    assert left == np.argsort(scores, kind="stable").tolist()
+
+
+@pytest.mark.parametrize("equal", [False, True], ids=["different scores", "equal scores"])
+def test_limbs_against_a_search_without_short_cuts(person, equal):
+    """All middles with all their ends, sorted by score, of which those are taken that lie apart."""
+    hull, placed = person.hull, person.placed
+    grid = (hull.sdf, hull.origin_m, hull.voxel_m)
+    explained = search.explained_volume(hull, placed, search.UPPER_TRUNK_PARTS)
+    base, lengths, radii = placed.origins[BONE["thigh_L"]], np.array([0.4, 0.38]), np.array([0.07, 0.05, 0.04])
+    near, uniform = person.medial.points[::7][:200], sphere_directions(60)
+    forbidden, skip, tip, clip, weight, keep = np.array([0.0, 0.0, 1.0, 0.6]), 0.3, 0.05, 0.04, 1.5, 40
+    if equal:  # two ends of one score
+        near = np.repeat(near, 2, axis=0)
+    points, directions = (np.ascontiguousarray(a.T) for a in (near[:, :3], uniform))
+
+    def bones(start, length, ra, rb, cone, hidden):
+        ways, scratch = np.zeros((7, 1000)), kernels.chunk_scratch()
+        count = limb_kernels.ways_from(start, length, cone, points, directions, ways, scratch[0])
+        limb_kernels.score_tubes(*grid, start, ra, rb, 6, clip, hidden[0], ways, count, scratch)
+        ways = np.ascontiguousarray(ways[:, :count][:, ways[6, :count] <= 3.2])
+        out = np.zeros((7, 1000))
+        out[:, : ways.shape[1]] = ways
+        args = (explained, hull.origin_m, search.STRIDE * hull.voxel_m, start, hidden[1], weight)
+        limb_kernels.add_explained(*args, out, ways.shape[1], scratch[1])
+        return out[:, : ways.shape[1]].T
+
+    middles = bones(base, lengths[0], radii[0], radii[1], forbidden, (skip, 0.4))[:, 3:]
+    first = kernels.spread_out(middles, np.argsort(middles[:, 3], kind="stable"), 0.12 * lengths[0], 24)
+    rows = []
+    for middle in middles[first]:
+        back = np.append(-(middle[:3] - base) / lengths[0], 0.87)
+        for way in bones(middle[:3], lengths[1], radii[1], radii[2], back, (0.0, 0.0)):
+            phi = kernels.depth_at(*grid, *(way[3:6] + 0.5 * tip * way[:3]))
+            rows.append([*middle[:3], *way[3:6], middle[3] + (way[6] + 0.3 * np.clip(phi / clip, 0.0, 1.0))])
+    rows = sorted(rows, key=lambda row: row[6])
+    kept = []
+    for row in np.array(rows):
+        gaps = [np.linalg.norm((row - other)[:6].reshape(2, 3), axis=1).max() for other in kept]
+        if min(gaps, default=1.0) >= 0.22 * lengths[0]:
+            kept.append(row)
+    found = limb_kernels.search_limb(
+        base, lengths, radii, tip, near, uniform, *grid, explained, search.STRIDE, skip, clip, weight, forbidden, keep
+    )
+    assert 10 < len(found) == min(len(kept), keep)
+    np.testing.assert_allclose(found, kept[:keep], atol=1e-9)

@@ -10,49 +10,20 @@ import numpy as np
 from numba import njit
 
 from limbloc_ros.core._part_kernels import distance_to_part, lay_out
-from limbloc_ros.core._search_kernels import depth_at, spread_out
+from limbloc_ros.core._search_kernels import CHUNK, chunk_scratch, depths_at, spread_out
 
 #: Ragged masks eat into limbs: a bone may be thinner than expected by this fraction of its radius at no cost.
 EATEN = 0.4
-
-
-@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
-def tube_score(
-    sdf: Any,
-    origin: Any,
-    voxel: float,
-    ax: float,
-    ay: float,
-    az: float,
-    bx: float,
-    by: float,
-    bz: float,
-    ra: float,
-    rb: float,
-    steps: int,
-    clip: float,
-    skip: float,
-    most: float,
-) -> float:
-    """Mean clipped miss of a cone between two points, from the fraction `skip` on: phi + radius, outside doubled.
-
-    Any value above `most` stands for a worse score.
-    """
-    total = 0.0
-    enough = most * steps * clip * clip
-    for n in range(steps):
-        t = skip + (1.0 - skip) * (n + 0.5) / steps
-        e = depth_at(sdf, origin, voxel, ax + t * (bx - ax), ay + t * (by - ay), az + t * (bz - az))
-        if e > 0.0:
-            e += clip  # the bone itself lies outside: constraint 3
-        e += ra + t * (rb - ra)
-        if e > 0.0:
-            e = 2.0 * max(e - EATEN * (ra + t * (rb - ra)), 0.0)
-        e = min(max(e, -clip), 2.0 * clip)
-        total += e * e
-        if total > enough:
-            break
-    return total / (steps * clip * clip)
+#: A bone is looked at in so many places, and explained volume along it in so many.
+STEPS, LOOKS = 6, 4
+#: Bones that fit worse than this are no candidates (4 is the worst possible), nor those this much too short or long.
+WORST, STRETCHED = 3.2, 0.15
+#: The end's bone may turn back on the middle's up to this cosine: a limb does not fold onto itself.
+FOLDED = 0.87
+#: What a tip outside the hull counts.
+TIP_WEIGHT = 0.3
+#: So many middles get ends, so far apart; and so far (as parts of the first bone) differ limbs that are both returned.
+MIDDLES, MIDDLES_APART, LIMBS_APART = 24, 0.12, 0.22
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
@@ -89,19 +60,175 @@ def explained_grid(sdf: Any, origin: Any, voxel: float, stride: int, parts: Any,
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
-def explained_fraction(
-    grid: Any, origin: Any, cell: float, ax: float, ay: float, az: float, bx: float, by: float, bz: float, skip: float
-) -> float:
-    """Mean of the explained grid along a bone, from the fraction `skip` on."""
-    total = 0.0
-    for n in range(4):
-        t = skip + (1.0 - skip) * (n + 0.5) / 4
-        i = int((ax + t * (bx - ax) - origin[0]) / cell + 0.5)
-        j = int((ay + t * (by - ay) - origin[1]) / cell + 0.5)
-        k = int((az + t * (bz - az) - origin[2]) / cell + 0.5)
-        if i >= 0 and j >= 0 and k >= 0 and i < grid.shape[0] and j < grid.shape[1] and k < grid.shape[2]:
-            total += grid[i, j, k]
-    return total / 4
+def ways_from(start: Any, length: float, forbidden: Any, points: Any, uniform: Any, ways: Any, work: Any) -> int:
+    """Unit directions from `start` [3]: to points [3, N] about `length` away, then of uniform [3, D] ones; to `ways`.
+
+    Those within the cone `forbidden` [4] (direction, cosine) are left out. Returns how many there are; `ways` [7, M]
+    gets directions and where they end after `length`.
+    """
+    x0, y0, z0 = start[0], start[1], start[2]
+    fx, fy, fz, cosine = forbidden[0], forbidden[1], forbidden[2], forbidden[3]
+    shortest, longest = (1.0 - STRETCHED) * length, (1.0 + STRETCHED) * length
+    # Most points are too near or too far. By their squares, vector code leaves few, of which roots are taken.
+    least, most = shortest * shortest * (1.0 - 1e-9), longest * longest * (1.0 + 1e-9)
+    some = 0
+    for first in range(0, points.shape[1], CHUNK):
+        size = min(CHUNK, points.shape[1] - first)
+        for n in range(size):
+            dx, dy, dz = points[0, first + n] - x0, points[1, first + n] - y0, points[2, first + n] - z0
+            square = dx * dx + dy * dy + dz * dz
+            work[n] = 1.0 if least <= square <= most else 0.0
+        for n in range(size):
+            ways[6, some] = first + n
+            some += int(work[n])
+    count = 0
+    for m in range(some):
+        n = int(ways[6, m])
+        dx, dy, dz = points[0, n] - x0, points[1, n] - y0, points[2, n] - z0
+        away = math.sqrt(dx * dx + dy * dy + dz * dz)
+        dx /= away
+        dy /= away
+        dz /= away
+        ways[0, count], ways[1, count], ways[2, count] = dx, dy, dz
+        count += (away >= shortest) & (away <= longest) & (dx * fx + dy * fy + dz * fz <= cosine)
+    for n in range(uniform.shape[1]):
+        dx, dy, dz = uniform[0, n], uniform[1, n], uniform[2, n]
+        ways[0, count], ways[1, count], ways[2, count] = dx, dy, dz
+        count += dx * fx + dy * fy + dz * fz <= cosine
+    for n in range(count):
+        ways[3, n] = x0 + length * ways[0, n]
+        ways[4, n] = y0 + length * ways[1, n]
+        ways[5, n] = z0 + length * ways[2, n]
+    return count
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def score_tubes(
+    sdf: Any, origin: Any, voxel: float, start: Any, ra: float, rb: float, steps: int, clip: float, skip: float,
+    ways: Any, count: int, scratch: tuple[Any, Any, Any],
+) -> None:  # fmt: skip
+    """How badly cones from `start` [3] to the ends ways[3:6] of the first `count` ways fit into the hull, to ways[6].
+
+    The mean clipped square of a cone's miss, from the fraction `skip` of the bone on: phi + radius, outside doubled.
+    """
+    work, cells, corners = scratch
+    ax, ay, az = start[0], start[1], start[2]
+    norm = steps * clip * clip
+    for first in range(0, count, CHUNK):
+        for n in range(CHUNK):
+            ways[6, first + n] = 0.0
+        for step in range(steps):
+            t = skip + (1.0 - skip) * (step + 0.5) / steps
+            radius = ra + t * (rb - ra)
+            for n in range(CHUNK):
+                work[n] = ax + t * (ways[3, first + n] - ax)
+                work[CHUNK + n] = ay + t * (ways[4, first + n] - ay)
+                work[2 * CHUNK + n] = az + t * (ways[5, first + n] - az)
+            depths_at(sdf, origin, voxel, work, cells, corners)
+            for n in range(CHUNK):
+                e = work[3 * CHUNK + n]
+                e += clip if e > 0.0 else 0.0  # the bone itself lies outside: constraint 3
+                e += radius
+                e = 2.0 * max(e - EATEN * radius, 0.0) if e > 0.0 else e
+                e = min(max(e, -clip), 2.0 * clip)
+                ways[6, first + n] += e * e
+        for n in range(CHUNK):
+            ways[6, first + n] /= norm
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def add_explained(
+    grid: Any, origin: Any, cell: float, start: Any, skip: float, weight: float, ways: Any, count: int, cells: Any
+) -> None:
+    """Add to ways[6] the mean of the explained grid along each bone, from the fraction `skip` on, times `weight`."""
+    ax, ay, az = start[0], start[1], start[2]
+    x0, y0, z0 = origin[0], origin[1], origin[2]
+    nx, ny, nz = grid.shape
+    totals = np.empty(CHUNK)
+    for first in range(0, count, CHUNK):
+        for n in range(CHUNK):
+            totals[n] = 0.0
+        for look in range(LOOKS):
+            t = skip + (1.0 - skip) * (look + 0.5) / LOOKS
+            for n in range(CHUNK):
+                cells[n] = np.int32((ax + t * (ways[3, first + n] - ax) - x0) / cell + 0.5)
+                cells[CHUNK + n] = np.int32((ay + t * (ways[4, first + n] - ay) - y0) / cell + 0.5)
+                cells[2 * CHUNK + n] = np.int32((az + t * (ways[5, first + n] - az) - z0) / cell + 0.5)
+            for n in range(min(CHUNK, count - first)):
+                i, j, k = cells[n], cells[CHUNK + n], cells[2 * CHUNK + n]
+                if i >= 0 and j >= 0 and k >= 0 and i < nx and j < ny and k < nz:
+                    totals[n] += grid[i, j, k]
+        for n in range(CHUNK):
+            ways[6, first + n] += weight * (totals[n] / LOOKS)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def bones_from(
+    start: Any, length: float, ra: float, rb: float, forbidden: Any, points: Any, uniform: Any,
+    sdf: Any, origin: Any, voxel: float, explained: Any, cell: float, hidden: tuple[float, float],
+    clip: float, explained_weight: float, ways: Any, scratch: tuple[Any, Any, Any],
+) -> int:  # fmt: skip
+    """Bones from `start` [3] that fit into the hull: direction, end and score, to `ways` [7, M]; returns how many.
+
+    Of a bone the first part lies in other flesh: so much is `hidden` from the hull, and from what is explained.
+    """
+    count = ways_from(start, length, forbidden, points, uniform, ways, scratch[0])
+    score_tubes(sdf, origin, voxel, start, ra, rb, STEPS, clip, hidden[0], ways, count, scratch)
+    kept = 0
+    for n in range(count):
+        for i in range(7):
+            ways[i, kept] = ways[i, n]
+        kept += ways[6, n] <= WORST
+    add_explained(explained, origin, cell, start, hidden[1], explained_weight, ways, kept, scratch[1])
+    return kept
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def push(heap: Any, count: int, scores: Any, new: int) -> None:
+    """Add a row to a heap of `count` rows: parents score less than their two children, or the same and come before."""
+    at = count
+    while at > 0:
+        up = (at - 1) // 2
+        if scores[heap[up]] < scores[new] or (scores[heap[up]] == scores[new] and heap[up] < new):
+            break
+        heap[at] = heap[up]
+        at = up
+    heap[at] = new
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def pop(heap: Any, count: int, scores: Any) -> int:
+    """Take the row of the least score from a heap of `count` rows; of equals the first."""
+    least = heap[0]
+    last = heap[count - 1]
+    at = 0
+    while 2 * at + 1 < count:
+        down = 2 * at + 1
+        if down + 1 < count:
+            a, b = heap[down], heap[down + 1]
+            if scores[b] < scores[a] or (scores[b] == scores[a] and b < a):
+                down += 1
+        if scores[last] < scores[heap[down]] or (scores[last] == scores[heap[down]] and last < heap[down]):
+            break
+        heap[at] = heap[down]
+        at = down
+    heap[at] = last
+    return least  # type: ignore[no-any-return]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def keep_new(found: Any, n: int, kept: Any, count: int, apart: float) -> int:
+    """Add limb `n` of `found` to the `count` ones that are kept, unless it lies near one; how many were added."""
+    for k in range(count):
+        d1 = 0.0
+        d2 = 0.0
+        for i in range(3):
+            d1 += (found[n, i] - kept[k, i]) ** 2
+            d2 += (found[n, 3 + i] - kept[k, 3 + i]) ** 2
+        if d1 < apart**2 and d2 < apart**2:
+            return 0
+    kept[count] = found[n]
+    return 1
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
@@ -130,105 +257,66 @@ def search_limb(
 
     Returns float64 [M, 7]: middle, end, score; the best first.
     """
-    n1 = len(candidates) + len(directions)
-    middle = np.empty((n1, 4))
-    count = 0
-    for n in range(n1):
-        if n < len(candidates):
-            dx = candidates[n, 0] - base[0]
-            dy = candidates[n, 1] - base[1]
-            dz = candidates[n, 2] - base[2]
-            length = math.sqrt(dx * dx + dy * dy + dz * dz)
-            if length < 0.85 * lengths[0] or length > 1.15 * lengths[0]:
-                continue
-            dx /= length
-            dy /= length
-            dz /= length
-        else:
-            dx, dy, dz = directions[n - len(candidates)]
-        if dx * forbidden[0] + dy * forbidden[1] + dz * forbidden[2] > forbidden[3]:
-            continue
-        x = base[0] + lengths[0] * dx
-        y = base[1] + lengths[0] * dy
-        z = base[2] + lengths[0] * dz
-        s = tube_score(
-            sdf, origin, voxel, base[0], base[1], base[2], x, y, z, tube_radii[0], tube_radii[1], 6, clip, skip, 3.2
-        )
-        if s > 3.2:
-            continue
-        s += explained_weight * explained_fraction(
-            explained, origin, stride * voxel, base[0], base[1], base[2], x, y, z, 0.4
-        )
-        middle[count, 0] = x
-        middle[count, 1] = y
-        middle[count, 2] = z
-        middle[count, 3] = s
-        count += 1
-    middle = middle[:count]
-    order = np.argsort(middle[:, 3])
-    apart = 0.12 * lengths[0]
-    chosen = spread_out(middle, order, apart, 24)
-    out = np.empty((len(chosen) * n1, 7))
-    total = 0
-    for m in chosen:
-        ex, ey, ez, s1 = middle[m]
-        ux = (ex - base[0]) / lengths[0]
-        uy = (ey - base[1]) / lengths[0]
-        uz = (ez - base[2]) / lengths[0]
-        for n in range(n1):
-            if n < len(candidates):
-                dx = candidates[n, 0] - ex
-                dy = candidates[n, 1] - ey
-                dz = candidates[n, 2] - ez
-                length = math.sqrt(dx * dx + dy * dy + dz * dz)
-                if length < 0.85 * lengths[1] or length > 1.15 * lengths[1]:
-                    continue
-                dx /= length
-                dy /= length
-                dz /= length
-            else:
-                dx, dy, dz = directions[n - len(candidates)]
-            if dx * ux + dy * uy + dz * uz < -0.87:  # a limb does not fold onto itself
-                continue
-            x = ex + lengths[1] * dx
-            y = ey + lengths[1] * dy
-            z = ez + lengths[1] * dz
-            s2 = tube_score(sdf, origin, voxel, ex, ey, ez, x, y, z, tube_radii[1], tube_radii[2], 6, clip, 0.0, 3.2)
-            if s2 > 3.2:
-                continue
-            s2 += explained_weight * explained_fraction(explained, origin, stride * voxel, ex, ey, ez, x, y, z, 0.0)
-            # the hand or heel goes on a little beyond the end
-            tip = depth_at(
-                sdf, origin, voxel, x + 0.5 * tip_length * dx, y + 0.5 * tip_length * dy, z + 0.5 * tip_length * dz
-            )
-            s2 += 0.3 * min(max(tip / clip, 0.0), 1.0)
-            out[total, 0] = ex
-            out[total, 1] = ey
-            out[total, 2] = ez
-            out[total, 3] = x
-            out[total, 4] = y
-            out[total, 5] = z
-            out[total, 6] = s1 + s2
-            total += 1
-    out = out[:total]
-    order = np.argsort(out[:, 6])
+    points = candidates.T.copy()
+    uniform = directions.T.copy()
+    most = (points.shape[1] + uniform.shape[1] + CHUNK - 1) // CHUNK * CHUNK
+    ways = np.zeros((7, most + CHUNK))
+    scratch = chunk_scratch()
+    work, cells, corners = scratch
+    cell = stride * voxel
+    count = bones_from(
+        base, lengths[0], tube_radii[0], tube_radii[1], forbidden, points, uniform, sdf, origin, voxel, explained, cell,
+        (skip, 0.4), clip, explained_weight, ways, scratch,
+    )  # fmt: skip
+    middle = ways[3:, :count].T.copy()
+    chosen = spread_out(middle, np.argsort(middle[:, 3]), MIDDLES_APART * lengths[0], MIDDLES)
+    found = np.empty((len(chosen) * most, 7))
+    scores = np.empty(len(found))
+    heap = np.empty(len(found), np.int64)
+    total, waiting = 0, 0
+    back = np.empty(4)
+    back[3] = FOLDED
     kept = np.empty((keep, 7))
-    count = 0
-    apart2 = (0.22 * lengths[0]) ** 2
-    for n in order:
-        ok = True
-        for m in range(count):
-            d1 = 0.0
-            d2 = 0.0
-            for i in range(3):
-                d1 += (out[n, i] - kept[m, i]) ** 2
-                d2 += (out[n, 3 + i] - kept[m, 3 + i]) ** 2
-            if d1 < apart2 and d2 < apart2:
-                ok = False
+    best = 0
+    tied = False
+    apart = LIMBS_APART * lengths[0]
+    for c in range(len(chosen)):
+        m = chosen[c]
+        for i in range(3):
+            back[i] = -((middle[m, i] - base[i]) / lengths[0])
+        count = bones_from(
+            middle[m], lengths[1], tube_radii[1], tube_radii[2], back, points, uniform, sdf, origin, voxel, explained,
+            cell, (0.0, 0.0), clip, explained_weight, ways, scratch,
+        )  # fmt: skip
+        for first in range(0, count, CHUNK):
+            for n in range(CHUNK):  # the hand or heel goes on a little beyond the end
+                for i in range(3):
+                    work[i * CHUNK + n] = ways[3 + i, first + n] + 0.5 * tip_length * ways[i, first + n]
+            depths_at(sdf, origin, voxel, work, cells, corners)
+            for n in range(first, min(first + CHUNK, count)):
+                tip = work[3 * CHUNK + n - first]
+                score = middle[m, 3] + (ways[6, n] + TIP_WEIGHT * min(max(tip / clip, 0.0), 1.0))
+                for i in range(3):
+                    found[total, i] = middle[m, i]
+                    found[total, 3 + i] = ways[3 + i, n]
+                found[total, 6] = score
+                scores[total] = score
+                push(heap, waiting, scores, total)
+                total += 1
+                waiting += 1
+        # Ends of later middles score no less than those: what is better is not waited for.
+        settled = middle[chosen[c + 1], 3] if c + 1 < len(chosen) else math.inf
+        while waiting > 0 and scores[heap[0]] < settled and best < keep and not tied:
+            n = pop(heap, waiting, scores)
+            waiting -= 1
+            tied = waiting > 0 and scores[heap[0]] == scores[n]
+            best += keep_new(found, n, kept, best, apart)
+        if best == keep and not tied:
+            break
+    if tied:  # the order of equals has always been that in which a sort of all leaves them, and figures depend on it
+        best = 0
+        for n in np.argsort(scores[:total]):
+            best += keep_new(found, n, kept, best, apart)
+            if best == keep:
                 break
-        if ok:
-            kept[count] = out[n]
-            count += 1
-            if count == keep:
-                break
-    return kept[:count]
+    return kept[:best]

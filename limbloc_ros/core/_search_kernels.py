@@ -8,6 +8,10 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+#: So many points are looked up at once by `depths_at`.
+CHUNK = 64
+_ONE = np.uint32(1)
+
 
 @njit(cache=True, inline="always", error_model="numpy")  # type: ignore[misc, unused-ignore]
 def depth_at(sdf: Any, origin: Any, voxel: float, x: float, y: float, z: float) -> float:
@@ -28,6 +32,58 @@ def depth_at(sdf: Any, origin: Any, voxel: float, x: float, y: float, z: float) 
     v0 = v00 + b * (v01 - v00)
     v1 = v10 + b * (v11 - v10)
     return v0 + a * (v1 - v0)  # type: ignore[no-any-return]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def chunk_scratch() -> tuple[Any, Any, Any]:
+    """`work`, `cells` and `corners` of `depths_at`."""
+    return np.zeros(7 * CHUNK), np.zeros(3 * CHUNK, np.int32), np.zeros(8 * CHUNK, np.float32)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def depths_at(sdf: Any, origin: Any, voxel: float, work: Any, cells: Any, corners: Any) -> None:
+    """`depth_at` of CHUNK points, whose x, y, z stand in `work` one after the other; depths go behind these.
+
+    All but the reading of the corners becomes vector code, for which each loop reads and writes plain runs.
+    """
+    x0, y0, z0 = origin[0], origin[1], origin[2]
+    last_x, last_y, last_z = sdf.shape[0] - 1.001, sdf.shape[1] - 1.001, sdf.shape[2] - 1.001
+    for n in range(CHUNK):
+        gx = min(max((work[n] - x0) / voxel, 0.0), last_x)
+        gy = min(max((work[CHUNK + n] - y0) / voxel, 0.0), last_y)
+        gz = min(max((work[2 * CHUNK + n] - z0) / voxel, 0.0), last_z)
+        i = np.int32(gx)
+        j = np.int32(gy)
+        k = np.int32(gz)
+        cells[n] = i
+        cells[CHUNK + n] = j
+        cells[2 * CHUNK + n] = k
+        work[4 * CHUNK + n] = gx - i
+        work[5 * CHUNK + n] = gy - j
+        work[6 * CHUNK + n] = gz - k
+    for n in range(CHUNK):  # unsigned: no index counts from the end
+        x = np.uint32(cells[n])
+        y = np.uint32(cells[CHUNK + n])
+        z = np.uint32(cells[2 * CHUNK + n])
+        corners[n] = sdf[x, y, z]
+        corners[CHUNK + n] = sdf[x, y, z + _ONE]
+        corners[2 * CHUNK + n] = sdf[x, y + _ONE, z]
+        corners[3 * CHUNK + n] = sdf[x, y + _ONE, z + _ONE]
+        corners[4 * CHUNK + n] = sdf[x + _ONE, y, z]
+        corners[5 * CHUNK + n] = sdf[x + _ONE, y, z + _ONE]
+        corners[6 * CHUNK + n] = sdf[x + _ONE, y + _ONE, z]
+        corners[7 * CHUNK + n] = sdf[x + _ONE, y + _ONE, z + _ONE]
+    for n in range(CHUNK):
+        a = work[4 * CHUNK + n]
+        b = work[5 * CHUNK + n]
+        c = work[6 * CHUNK + n]
+        v00 = corners[n] + c * (corners[CHUNK + n] - corners[n])
+        v01 = corners[2 * CHUNK + n] + c * (corners[3 * CHUNK + n] - corners[2 * CHUNK + n])
+        v10 = corners[4 * CHUNK + n] + c * (corners[5 * CHUNK + n] - corners[4 * CHUNK + n])
+        v11 = corners[6 * CHUNK + n] + c * (corners[7 * CHUNK + n] - corners[6 * CHUNK + n])
+        v0 = v00 + b * (v01 - v00)
+        v1 = v10 + b * (v11 - v10)
+        work[3 * CHUNK + n] = v0 + a * (v1 - v0)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
