@@ -168,10 +168,33 @@ def test_discs_between_two_rows_cover_nothing():
     """Neither they nor the way between them meets the centre of a cell; one part lies across a row, one does not."""
     frames, cells = np.array([[0, 0, 8, 8, 1, 0]]), np.zeros(64, np.uint8)
     discs = np.array([[3.0, 4.0 - 2e-8, 1e-8], [3.0, 4.0 + 2e-8, 1e-8], [3.3, 4.3, 0.1]])
-    span, drawn = np.empty((8, 2)), np.zeros(64, np.int16)
+    span, drawn = np.empty((2, 8)), np.zeros(64, np.int16)
     parts = np.array([[0, 1, 1], [2, 2, 2]])
     assert kernels.draw_parts(parts, discs, frames[0], span, cells, drawn, 1, False) == (0, 0)
     assert not drawn.any()
+
+
+def test_cells_are_counted_as_they_are_drawn():
+    """Parts of all sizes, beside and behind the cameras too, over foreground, background and what nobody is asked."""
+    rng = np.random.default_rng(5)
+    rig = ring(3, focal=210.0, size=(288, 216))
+    frames = np.array(
+        [[0, 0, 288, 216, 1, 0], [20, 30, 77, 13, 3, 62208], [9, 5, 0, 0, 2, 63209], [0, 0, 5, 9, 7, 63209]]
+    )
+    views = Views(pack_cameras(rig)[[0, 1, 2, 0]], frames, rng.integers(0, 3, 63254).astype(np.uint8))
+    kinds = [views.cells == kind for kind in (kernels.SEEN, kernels.BARE)]
+    most = 0
+    for n in range(60):
+        centres = np.array([0.0, 0.0, 1.0]) + rng.uniform(-1, 1, (12, 3)) * [0.2, 1.0, 5.0][n % 3]
+        radii = rng.uniform(0.0, 0.3, 12) ** 2
+        parts = np.sort(rng.integers(0, 12, (6, 3)), axis=1)
+        drawn = views.drawn(parts, centres, radii) != 0
+        cells = [[np.count_nonzero(drawn[o : o + w * h] & kind[o : o + w * h]) for kind in kinds]
+                 for _, _, w, h, _, o in frames]  # fmt: skip
+        counts = kernels.covered(parts, centres, radii, views.cameras, frames, *views._bits)
+        np.testing.assert_array_equal(counts, cells)
+        most = max(most, counts.max())
+    assert most > 5000
 
 
 def test_arrays_of_any_layout_are_drawn_by_the_same_kernel():
@@ -182,6 +205,10 @@ def test_arrays_of_any_layout_are_drawn_by_the_same_kernel():
     assert not spread.flags.c_contiguous
     assert (views.drawn(BALL, spread, np.repeat(RADIUS, 4)[::2]) == expected).all()
     assert len(kernels.draw.signatures) == compiled
+    views.mismatch(BALL, CENTRE, RADIUS)
+    compiled = len(kernels.covered.signatures)
+    views.mismatch(BALL, spread, np.repeat(RADIUS, 4)[::2])
+    assert len(kernels.covered.signatures) == compiled
 
 
 def test_a_hull_has_no_views_that_cannot_be_sent(monkeypatch):

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+from limbloc_ros.core._bit_kernels import WORD, between, count
 from limbloc_ros.core._projection_kernels import project, project_block, row_start
 from limbloc_ros.core._union_kernels import join, root
 
@@ -20,6 +21,7 @@ BODY = -1
 CLOSEST = 0.1
 #: Nor what is seen so many cells off.
 FAR = 1e6
+_ONE, _LAST = np.uint64(1), np.uint64(WORD - 1)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
@@ -104,31 +106,37 @@ def keep_held(image: Any, marks: Any) -> tuple[int, int, int, int]:
     return (left, right, top, bottom) if right > 0 else (0, 0, 0, 0)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
-def _widen(span: Any, row: int, x: float) -> None:
-    span[row, 0] = min(span[row, 0], x)
-    span[row, 1] = max(span[row, 1], x)
+# Rows are counted without a sign in these loops: an index that cannot count from the end leaves vector code.
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
-def _disc(x: float, y: float, r: float, height: int, span: Any) -> None:
-    for row in range(max(0, math.ceil(y - r)), min(height - 1, math.floor(y + r)) + 1):
-        half = math.sqrt(max(0.0, r * r - (row - y) * (row - y)))
-        _widen(span, row, x - half)
-        _widen(span, row, x + half)
+def _widen_by_disc(x: float, y: float, r: float, height: int, left: Any, right: Any) -> None:
+    first = max(0, math.ceil(y - r))
+    last = max(first - 1, min(height - 1, math.floor(y + r)))
+    for row in range(np.uint64(first), np.uint64(last + 1)):
+        away = np.float64(np.int64(row)) - y
+        half = math.sqrt(max(0.0, r * r - away * away))
+        left[row] = min(left[row], x - half)
+        right[row] = max(right[row], x + half)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
-def _segment(x0: float, y0: float, x1: float, y1: float, height: int, span: Any) -> None:
+def _widen_by_segment(x0: float, y0: float, x1: float, y1: float, height: int, left: Any, right: Any) -> None:
     if y0 > y1:
         x0, y0, x1, y1 = x1, y1, x0, y0
     slope = (x1 - x0) / (y1 - y0) if y1 - y0 > 1e-9 else 0.0  # of less it need not be a number
-    for row in range(max(0, math.ceil(y0)), min(height - 1, math.floor(y1)) + 1):
-        _widen(span, row, x0 + slope * (row - y0))
+    first = max(0, math.ceil(y0))
+    last = max(first - 1, min(height - 1, math.floor(y1)))
+    for row in range(np.uint64(first), np.uint64(last + 1)):
+        x = x0 + slope * (np.float64(np.int64(row)) - y0)
+        left[row] = min(left[row], x)
+        right[row] = max(right[row], x)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
-def _tangents(x0: float, y0: float, r0: float, x1: float, y1: float, r1: float, height: int, span: Any) -> None:
+def _widen_by_tangents(
+    x0: float, y0: float, r0: float, x1: float, y1: float, r1: float, height: int, left: Any, right: Any
+) -> None:
     """The two outer tangents of two discs; none if one lies in the other."""
     dx, dy = x1 - x0, y1 - y0
     square = dx * dx + dy * dy
@@ -139,7 +147,7 @@ def _tangents(x0: float, y0: float, r0: float, x1: float, y1: float, r1: float, 
     for sign in (-1.0, 1.0):
         nx = along * dx - sign * across * dy
         ny = along * dy + sign * across * dx
-        _segment(x0 + r0 * nx, y0 + r0 * ny, x1 + r1 * nx, y1 + r1 * ny, height, span)
+        _widen_by_segment(x0 + r0 * nx, y0 + r0 * ny, x1 + r1 * nx, y1 + r1 * ny, height, left, right)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
@@ -157,46 +165,56 @@ def see_balls(centres: Any, radii: Any, cams: Any, c: int, frame: Any, discs: An
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def _outline(parts: Any, p: int, discs: Any, height: int, left: Any, right: Any) -> tuple[int, int]:
+    """First and last row in which part `p` is seen; its outermost columns in each, not yet whole, to left and right.
+
+    A part is the convex hull of three balls; here that of the three discs that the balls are seen as: in each row its
+    outermost points lie on a disc or on an outer tangent of two.
+    """
+    a, b, d = parts[p, 0], parts[p, 1], parts[p, 2]
+    if min(discs[a, 2], discs[b, 2], discs[d, 2]) < 0.0:
+        return 0, -1
+    low, high = math.inf, -math.inf
+    for n in (a, b, d):
+        low = min(low, discs[n, 1] - discs[n, 2])
+        high = max(high, discs[n, 1] + discs[n, 2])
+    first = max(0, math.ceil(min(low, float(height))))
+    last = min(height - 1, math.floor(max(high, -1.0)))
+    for row in range(first, last + 1):
+        left[row] = math.inf
+        right[row] = -math.inf
+    for m, n in ((a, b), (b, d), (d, a)):
+        if m == n:
+            continue
+        _widen_by_disc(discs[m, 0], discs[m, 1], discs[m, 2], height, left, right)
+        _widen_by_tangents(
+            discs[m, 0], discs[m, 1], discs[m, 2], discs[n, 0], discs[n, 1], discs[n, 2], height, left, right
+        )  # fmt: skip
+    if a == b and b == d:
+        _widen_by_disc(discs[a, 0], discs[a, 1], discs[a, 2], height, left, right)
+    return first, last
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def draw_parts(
     parts: Any, discs: Any, frame: Any, span: Any, cells: Any, drawn: Any, mark: int, alone: bool
 ) -> tuple[int, int]:
     """Write `mark` to the cells of one camera whose centres the parts cover, but where `drawn` is BODY.
 
-    Another mark that is there already is replaced, or with `alone` both give way to BODY. A part is the convex hull of
-    three balls; here that of the three discs that the balls are seen as, row by row: its outermost points there lie on
-    a disc or on an outer tangent of two.
+    Another mark that is there already is replaced, or with `alone` both give way to BODY. `span` is scratch, [2, rows].
 
     Returns how many of the cells that get this mark are foreground, and background.
     """
     _, _, width, height, _, offset = frame
+    left, right = span
     seen, bare = 0, 0
     for p in range(len(parts)):
-        a, b, d = parts[p]
-        if min(discs[a, 2], discs[b, 2], discs[d, 2]) < 0.0:
-            continue
-        low, high = math.inf, -math.inf
-        for n in (a, b, d):
-            low = min(low, discs[n, 1] - discs[n, 2])
-            high = max(high, discs[n, 1] + discs[n, 2])
-        first = max(0, math.ceil(min(low, float(height))))
-        last = min(height - 1, math.floor(max(high, -1.0)))
+        first, last = _outline(parts, p, discs, height, left, right)
         for row in range(first, last + 1):
-            span[row, 0] = math.inf
-            span[row, 1] = -math.inf
-        for m, n in ((a, b), (b, d), (d, a)):
-            if m == n:
-                continue
-            _disc(discs[m, 0], discs[m, 1], discs[m, 2], height, span)
-            _tangents(
-                discs[m, 0], discs[m, 1], discs[m, 2], discs[n, 0], discs[n, 1], discs[n, 2], height, span
-            )  # fmt: skip
-        if a == b and b == d:
-            _disc(discs[a, 0], discs[a, 1], discs[a, 2], height, span)
-        for row in range(first, last + 1):
-            if not span[row, 0] <= span[row, 1]:
+            if not left[row] <= right[row]:
                 continue  # between two discs that are hardly points; infinity is no column
-            begin = math.ceil(max(span[row, 0], 0.0))
-            end = math.floor(min(span[row, 1], width - 1.0))
+            begin = math.ceil(max(left[row], 0.0))
+            end = math.floor(min(right[row], width - 1.0))
             for at in range(offset + row * width + begin, offset + row * width + end + 1):
                 if drawn[at] != mark and drawn[at] != BODY:
                     if alone and drawn[at] != 0:
@@ -217,11 +235,62 @@ def draw(parts: Any, centres: Any, radii: Any, cams: Any, frames: Any, cells: An
     Returns how many of these are foreground, and background, in every camera; int64 [C, 2].
     """
     discs = np.empty((len(centres), 3))
-    span = np.empty((max(1, frames[:, 3].max()), 2))
+    span = np.empty((2, max(1, frames[:, 3].max())))
     counts = np.empty((len(frames), 2), np.int64)
     for c in range(len(frames)):
         see_balls(centres, radii, cams, c, frames[c], discs)
         counts[c, 0], counts[c, 1] = draw_parts(parts, discs, frames[c], span, cells, drawn, BODY, False)
+    return counts
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def covered(parts: Any, centres: Any, radii: Any, cams: Any, frames: Any, seen: Any, bare: Any) -> Any:
+    """How many cells of foreground, and of background, a figure covers in every camera: int64 [C, 2]; see `draw`.
+
+    Cells are bits here, from the lowest one of the first word on, in all words of `seen` and of `bare`: what is drawn
+    over and over is ored, and all is counted in the end.
+    """
+    drawn = np.zeros(len(seen) + 1, np.uint64)
+    # only the balls of these parts
+    place = np.full(len(centres), -1)
+    balls = np.empty((len(centres), 4))
+    used = 0
+    own = np.empty_like(parts)
+    for p in range(len(parts)):
+        for k in range(3):
+            s = parts[p, k]
+            if place[s] < 0:
+                place[s] = used
+                balls[used, :3], balls[used, 3] = centres[s], radii[s]
+                used += 1
+            own[p, k] = place[s]
+    discs = np.empty((used, 3))
+    left, right = np.empty((2, max(1, frames[:, 3].max())))
+    counts = np.zeros((len(frames), 2), np.int64)
+    for c in range(len(frames)):
+        _, _, width, height, _, offset = frames[c]
+        see_balls(balls[:used, :3], balls[:used, 3], cams, c, frames[c], discs)
+        for p in range(len(parts)):
+            first, last = _outline(own, p, discs, height, left, right)
+            for row in range(np.uint64(first), np.uint64(last + 1)):  # first column, and how many: none if they cross
+                begin = math.ceil(min(max(left[row], 0.0), float(width)))
+                end = math.floor(min(max(right[row], -1.0), width - 1.0)) + 1
+                left[row], right[row] = begin, max(end - begin, 0)
+            for row in range(first, last + 1):
+                begin, columns = offset + row * width + int(left[row]), int(right[row])
+                k, shift = begin // WORD, np.uint64(begin % WORD)
+                if columns < WORD:  # mostly, and without a branch for the word in which they end
+                    some = (_ONE << np.uint64(columns)) - _ONE
+                    drawn[k] |= some << shift
+                    drawn[k + 1] |= (some >> _ONE) >> (_LAST - shift)
+                else:
+                    for k in range(begin // WORD, (begin + columns + WORD - 1) // WORD):
+                        drawn[k] |= between(begin, begin + columns, k)
+        end = offset + width * height
+        for k in range(offset // WORD, (end + WORD - 1) // WORD):
+            word = drawn[k] & between(offset, end, k)
+            counts[c, 0] += count(word & seen[k])
+            counts[c, 1] += count(word & bare[k])
     return counts
 
 
@@ -235,7 +304,7 @@ def draw_groups(
     `groups` [P] says to which each part belongs, 0 to count - 1.
     """
     discs = np.empty((len(centres), 3))
-    span = np.empty((max(1, frames[:, 3].max()), 2))
+    span = np.empty((2, max(1, frames[:, 3].max())))
     drawn = np.zeros(len(cells), np.int16)
     counts = np.zeros((len(frames), count + 2), np.int64)
     for c in range(len(frames)):
@@ -272,7 +341,7 @@ def draw_limbs(
     discs = np.empty((len(radii), 3))
     moved = np.empty((len(limbs), 3))
     limb_radii = radii[limbs, 0].copy()
-    span = np.empty((max(1, frames[:, 3].max()), 2))
+    span = np.empty((2, max(1, frames[:, 3].max())))
     q = 0
     for c in range(len(frames)):
         see_balls(radii[:, 1:], radii[:, 0], cams, c, frames[c], discs)

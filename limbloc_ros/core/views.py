@@ -160,21 +160,15 @@ class Views:
 
     def drawn(self, parts: NDArray[np.int64], centres: Array, radii: Array) -> NDArray[np.int16]:
         """Which cells a figure of parts [P, 3] over balls (centres [S, 3], radii [S], m) covers."""
-        return self._draw(parts, centres, radii)[0]
-
-    def _draw(
-        self, parts: NDArray[np.int64], centres: Array, radii: Array
-    ) -> tuple[NDArray[np.int16], NDArray[np.int64]]:
         out = np.zeros(len(self.cells), np.int16)
-        # Parts of other arrays, too: kernels are compiled for one layout, not again in the first frame with others.
-        figure = np.ascontiguousarray(parts), np.ascontiguousarray(centres), np.ascontiguousarray(radii)
-        counts = kernels.draw(*figure, self.cameras, self.frames, self.cells, out)
-        return out, counts
+        kernels.draw(*_contiguous(parts, centres, radii), self.cameras, self.frames, self.cells, out)
+        return out
 
     def mismatch(self, parts: NDArray[np.int64], centres: Array, radii: Array) -> float:
         """Area that the figure and the silhouettes do not share over that of the silhouettes; mean of the cameras that
         see anybody, in which one that sees far less than others (LEAST_SHARE) has less of a say."""
-        _, counts = self._draw(parts, centres, radii)
+        figure = _contiguous(parts, centres, radii)
+        counts = kernels.covered(*figure, self.cameras, self.frames, *self._bits)
         return float(self.worth @ (self.sizes - counts[:, 0] + counts[:, 1]))
 
     def shares(
@@ -189,6 +183,15 @@ class Views:
         counts = kernels.draw_groups(parts, groups, count, centres, radii, self.cameras, self.frames, self.cells)
         mismatch = self.sizes - counts[:, count] + counts[:, count + 1]
         return np.asarray(self.worth @ counts[:, :count]), float(self.worth @ mismatch)
+
+    @cached_property
+    def _bits(self) -> tuple[NDArray[np.uint64], NDArray[np.uint64]]:
+        """Which cells are foreground, and background, 64 cells a word."""
+        kinds = np.zeros((2, -(-len(self.cells) // 64) * 64), np.bool_)
+        kinds[0, : len(self.cells)] = self.cells == kernels.SEEN
+        kinds[1, : len(self.cells)] = self.cells == kernels.BARE
+        seen, bare = np.packbits(kinds, axis=1, bitorder="little").view("<u8").astype(np.uint64)
+        return seen, bare
 
     @cached_property
     def sizes(self) -> NDArray[np.int64]:
@@ -232,6 +235,11 @@ class Views:
             parts, moving, placed, balls, self.cameras, self.frames, self.cells, body.copy(), asked, covers, bare
         )
         return covers, self.worth @ bare
+
+
+def _contiguous(parts: NDArray[np.int64], centres: Array, radii: Array) -> tuple[NDArray[np.int64], Array, Array]:
+    """Parts of other arrays, too: kernels are compiled for one layout, not again in the first frame with others."""
+    return np.ascontiguousarray(parts), np.ascontiguousarray(centres), np.ascontiguousarray(radii)
 
 
 def _check(cameras: Array, frames: NDArray[np.int64], size: int) -> None:
