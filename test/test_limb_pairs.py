@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from flesh_hulls import POSTURES, person_in
 
-from limbloc_ros.core import energy, figure, limb_pairs, search
+from limbloc_ros.core import _part_kernels, energy, figure, limb_pairs, search
+from limbloc_ros.core import _surface_fit_kernels as surface_fit
 from limbloc_ros.core.energy import Evidence, Weights
 from limbloc_ros.core.engine_robust import SEARCH_WEIGHTS
 from limbloc_ros.core.figure import BONE, place
@@ -183,6 +184,34 @@ def test_best_alone_by_brute_force():
     order = np.argsort(total).tolist()
     assert kernels.best_alone(gaps, costs, own, body, 0.02, 100).tolist() == order
     assert kernels.best_alone(gaps, costs, own, body, 0.02, 5).tolist() == order[:5]
+
+
+@pytest.mark.parametrize("rays", [False, True], ids=["points", "rays"])
+def test_points_are_explained_by_the_nearest_part(rays):
+    """Against `nearest_part`, point by point."""
+    rng = np.random.default_rng(14)
+    count, surface = 200, np.array([0.06, 0.02, 0.5])
+    spheres, radii = rng.uniform(-0.5, 0.5, (12, 3)), rng.uniform(0.02, 0.15, 12)
+    parts = np.sort(rng.integers(0, 12, (9, 3)), axis=1)
+    query, (normals, directions) = rng.uniform(-0.7, 0.7, (count, 3)), rng.normal(size=(2, count, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    directions[:: 2 if rays else 1] = 0.0
+    within = rng.uniform(0.0, 0.3, count)
+    gaps, costs, w, away, far = np.empty(count), np.empty(count), np.empty(3), np.empty(3), np.empty(9)
+    scene, scratch = kernels.scene_of(query, normals, directions), np.empty((11, count))
+    kernels.explain(scene, query, directions, parts, spheres, radii, surface, within, scratch, gaps, costs)
+    rows, bounds = _part_kernels.lay_out(parts, spheres, radii)
+    for q in range(count):
+        point, ray = query[q], directions[q]
+        gap, p = surface_fit.nearest_part(point, normals[q], ray, rows, bounds, surface[1], within[q], -1, far, w)
+        if p < 0:
+            assert (gaps[q], costs[q]) == (np.inf, 0.0)
+            continue
+        d = surface_fit.offset_from(point, ray, parts[p], w, spheres, radii, away)
+        cost = surface_fit.robust_weight(d, surface[0])[0] * (surface[2] if d < 0.0 else 1.0)
+        assert (gaps[q], costs[q]) == pytest.approx((gap, cost), abs=1e-12)
+    assert 0.2 < np.isfinite(gaps).mean() < 0.8
 
 
 # the energy of pairs against that of whole figures

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from flesh_hulls import POSTURES, VOXEL, hull_where, person_in
 
-from limbloc_ros.core import search
+from limbloc_ros.core import figure, search
 from limbloc_ros.core.directions import sphere_directions
 from limbloc_ros.core.figure import BONE, place
 from limbloc_ros.core.search import ARM, LEG, Medial, kernels, limb_kernels
@@ -149,6 +149,23 @@ def test_hypotheses_differ_and_are_the_same_every_time(person):
             side = math.acos(min(1.0, abs(R[:, 1] @ Q[:, 1])))
             axis = math.acos(min(1.0, R[:, 2] @ Q[:, 2]))
             assert np.linalg.norm(a.root - b.root) >= 0.08 or max(side, axis) >= 0.4
+
+
+def test_different_torsos_against_numpy():
+    rng = np.random.default_rng(15)
+    poses = rng.normal(size=(300, 14)) * ([0.06] * 3 + [0.4] * 11)
+    turns = np.array([figure.kernels.exp_so3(pose[3:6]) for pose in poses])
+    turns[::3, :, :2] *= -1.0  # which way it looks does not matter
+    poses[::3, 3:6] = [figure.kernels.log_so3(R) for R in turns[::3]]
+    kept = []
+    for n, (pose, R) in enumerate(zip(poses, turns, strict=True)):
+        near = np.linalg.norm(poses[kept, :3] - pose[:3], axis=1) < 0.1
+        side, axis = (np.einsum("nij,ij->nj", turns[kept], R).T)[1:]
+        if not (near & (axis > np.cos(0.4)) & (np.abs(side) > np.cos(0.4))).any():
+            kept.append(n)
+    assert 40 < len(kept) < 280
+    for most in (1, 40, 300):
+        assert search.torso_kernels.distinct(poses, most, 0.1, 0.4).tolist() == kept[:most]
 
 
 def test_turning_about_keeps_the_volume_and_swaps_the_sides():

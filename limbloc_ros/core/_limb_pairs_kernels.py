@@ -11,8 +11,8 @@ from numba import njit
 
 from limbloc_ros.core._energy_kernels import blended_sphere, sample_sdf
 from limbloc_ros.core._figure_kernels import log_so3
-from limbloc_ros.core._part_kernels import distance_to_part, lay_out
-from limbloc_ros.core._surface_fit_kernels import nearest_part, offset_from, robust_weight
+from limbloc_ros.core._part_kernels import SLACK, distance_to_part, lay_out
+from limbloc_ros.core._surface_fit_kernels import across, gated_distance, offset_from, robust_weight
 
 #: A candidate pays at most so much (m^2) for violated joint limits.
 MOST_FOR_LIMITS = 5e-5
@@ -59,6 +59,73 @@ def limb_turns(upper: Any, lower: Any, parent: Any, rest: Any, sign: float, firs
         second[i, 1] = first[i, 1]
         second[i, 2] = s * first[i, 0] + c * first[i, 2]
     return flexion
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def scene_of(query: Any, normals: Any, rays: Any) -> Any:
+    """[9, Q] points, rays and what of the normals lies across these, each coordinate in a row."""
+    scene = np.empty((9, len(query)))
+    for q in range(len(query)):
+        for i in range(3):
+            scene[i, q] = query[q, i]
+            scene[3 + i, q] = rays[q, i]
+        scene[6, q], scene[7, q], scene[8, q] = across(normals[q], rays[q])
+    return scene
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def explain(
+    scene: Any, query: Any, rays: Any, parts: Any, spheres: Any, radii: Any, surface: Any, within: Any,
+    least_of: Any, gaps: Any, costs: Any,
+) -> None:  # fmt: skip
+    """How well parts explain points: gated distance and cost, to gaps and costs [Q]; inf and 0 if not `within` [Q].
+
+    The part is that of `nearest_part`. How near each part can be at least is worked out for all points at once, in
+    vector code, to `least_of` [2 + P, Q]: most points are far from all parts of a limb, or near to one only.
+    """
+    rows, bounds = lay_out(parts, spheres, radii)
+    count = len(query)
+    w = np.empty(3)
+    away = np.empty(3)
+    for q in range(count):
+        least_of[0, q] = math.inf  # the least, and the part that it is of
+        least_of[1, q] = 0.0
+    for p in range(len(parts)):
+        bx, by, bz, size = bounds[0, p], bounds[1, p], bounds[2, p], bounds[3, p] + SLACK
+        for q in range(count):
+            x, y, z = bx - scene[0, q], by - scene[1, q], bz - scene[2, q]
+            along = x * scene[3, q] + y * scene[4, q] + z * scene[5, q]
+            least = math.sqrt(max(x * x + y * y + z * z - along * along, 0.0)) - size
+            least_of[2 + p, q] = least
+            least_of[1, q] = p if least < least_of[0, q] else least_of[1, q]
+            least_of[0, q] = min(least, least_of[0, q])
+    for q in range(count):
+        best = within[q]
+        found = -1
+        if least_of[0, q] <= best:
+            x, y, z = scene[0, q], scene[1, q], scene[2, q]
+            likely = int(least_of[1, q])
+            for n in range(-1, len(parts)):
+                p = likely if n < 0 else n
+                if n == likely or least_of[2 + p, q] > best:
+                    continue
+                _, d, wb, wc = gated_distance(
+                    rows[p], x, y, z, rays[q], scene[6, q], scene[7, q], scene[8, q], surface[1]
+                )  # fmt: skip
+                if d < best or (d == best and p < found):
+                    best = d
+                    found = p
+                    w[0] = 1.0 - wb - wc
+                    w[1] = wb
+                    w[2] = wc
+        if found < 0:
+            gaps[q] = math.inf
+            costs[q] = 0.0
+            continue
+        d = offset_from(query[q], rays[q], parts[found], w, spheres, radii, away)
+        c, _ = robust_weight(d, surface[0])
+        gaps[q] = best
+        costs[q] = c * (surface[2] if d < 0.0 else 1.0)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
@@ -134,9 +201,9 @@ def limb_fits(
     end = np.empty(3)
     upper = np.empty(3)
     lower = np.empty(3)
-    w = np.empty(3)
     away = np.empty(3)
-    far = np.empty(len(limb_parts))
+    scene = scene_of(query, normals, rays)
+    least_of = np.empty((2 + len(limb_parts), len(query)))
     for m in range(len(found)):
         n1 = 0.0
         n2 = 0.0
@@ -162,18 +229,7 @@ def limb_fits(
             for i in range(3):
                 spheres[s, i] = start[i] + R[i, 0] * offsets[n, 0] + R[i, 1] * offsets[n, 1] + R[i, 2] * offsets[n, 2]
                 placed[m, n, i] = spheres[s, i]
-        rows, bounds = lay_out(limb_parts, spheres, radii)
-        p = -1
-        for q in range(len(query)):
-            gap, p = nearest_part(query[q], normals[q], rays[q], rows, bounds, surface[1], body_gap[q], p, far, w)
-            if p < 0:
-                gaps[m, q] = math.inf
-                costs[m, q] = 0.0
-                continue
-            d = offset_from(query[q], rays[q], limb_parts[p], w, spheres, radii, away)
-            c, _ = robust_weight(d, surface[0])
-            gaps[m, q] = gap
-            costs[m, q] = c * (surface[2] if d < 0.0 else 1.0)
+        explain(scene, query, rays, limb_parts, spheres, radii, surface, body_gap, least_of, gaps[m], costs[m])
         cost = 0.0
         for n in range(len(samples)):
             x, y, z, r = blended_sphere(samples[n], all_parts[sample_parts[n]], spheres, radii)
@@ -214,18 +270,12 @@ def limb_fits(
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def body_fit(query: Any, normals: Any, rays: Any, parts: Any, spheres: Any, radii: Any, surface: Any) -> Any:
     """How well the given parts explain each point: gated distance [Q], m, and cost [Q], m^2; see `limb_fits`."""
-    rows, bounds = lay_out(parts, spheres, radii)
-    w = np.empty(3)
-    away = np.empty(3)
-    far = np.empty(len(parts))
     gaps = np.empty(len(query))
     costs = np.empty(len(query))
-    p = -1
-    for q in range(len(query)):
-        gaps[q], p = nearest_part(query[q], normals[q], rays[q], rows, bounds, surface[1], 1e9, p, far, w)
-        d = offset_from(query[q], rays[q], parts[p], w, spheres, radii, away)
-        c, _ = robust_weight(d, surface[0])
-        costs[q] = c * (surface[2] if d < 0.0 else 1.0)
+    least_of = np.empty((2 + len(parts), len(query)))
+    within = np.full(len(query), 1e9)
+    scene = scene_of(query, normals, rays)
+    explain(scene, query, rays, parts, spheres, radii, surface, within, least_of, gaps, costs)
     return gaps, costs
 
 

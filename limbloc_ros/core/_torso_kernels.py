@@ -195,6 +195,36 @@ def torso_from_pairs(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def distinct(poses: Any, most: int, apart_m: float, apart_rad: float) -> Any:
+    """Rows of the first poses [N, 14] that differ from all before in place, or in axis or heading (modulo half a turn).
+
+    Others are alike; `most` are taken.
+    """
+    kept = np.empty(most, np.int64)
+    turns = np.empty((most, 3, 3))
+    least = math.cos(apart_rad)
+    count = 0
+    for n in range(len(poses)):
+        if count == most:
+            break
+        R = exp_so3(poses[n, 3:6])
+        new = True
+        for m in range(count):
+            away, axis, side = 0.0, 0.0, 0.0
+            for i in range(3):
+                away += (poses[kept[m], i] - poses[n, i]) ** 2
+                side += turns[m, i, 1] * R[i, 1]
+                axis += turns[m, i, 2] * R[i, 2]
+            if away < apart_m**2 and axis > least and abs(side) > least:
+                new = False
+                break
+        if new:
+            kept[count], turns[count] = n, R
+            count += 1
+    return kept[:count]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def climb_torso(
     start: Any, noise: Any, sdf: Any, origin: Any, voxel: float, table: Any, weights: Any, n_solid: int, spread: Any
 ) -> Any:

@@ -173,7 +173,7 @@ def torso_hypotheses(
         return []
     found = found[np.argsort(found[:, 13], kind="stable")]
     spread = np.array([0.02] * 3 + [0.15] * 3 + [0.15] * 3 + [0.15] * 3 + [0.04])
-    starts = _distinct(found, effort.compared, 0.10, 0.4)
+    starts = found[torso_kernels.distinct(found, effort.compared, 0.10, 0.4)]
     climbed = []
     for start in starts[np.argsort(_scores(starts, hull.views), kind="stable")[: effort.climbed]]:
         noise = rng.standard_normal((effort.steps, 13))
@@ -182,7 +182,8 @@ def torso_hypotheses(
         )
     ranked = np.array(climbed)
     ranked = ranked[np.argsort(_scores(ranked, hull.views), kind="stable")]
-    return [(_torso_state(pose), float(pose[13])) for pose in _distinct(ranked, keep, 0.08, 0.4)]
+    different = torso_kernels.distinct(ranked, keep, 0.08, 0.4)
+    return [(_torso_state(pose), float(pose[13])) for pose in ranked[different]]
 
 
 def _scores(poses: Array, views: Views | None) -> Array:
@@ -192,21 +193,6 @@ def _scores(poses: Array, views: Views | None) -> Array:
     placed = [figure.place(_torso_state(pose)) for pose in poses]
     seen = [views.mismatch(figure.PART_SPHERES[TRUNK_PARTS], torso.spheres, torso.radii) for torso in placed]
     return np.asarray(poses[:, 13] + np.array(seen))
-
-
-def _distinct(poses: Array, most: int, apart_m: float, apart_rad: float) -> Array:
-    """The first poses [N, 14] that differ from all before in place, or in axis or heading (modulo half a turn)."""
-    kept: list[int] = []
-    turns = np.array([exp_so3(pose[3:6]) for pose in poses])
-    least = math.cos(apart_rad)
-    for n, (pose, R) in enumerate(zip(poses, turns, strict=True)):
-        near = ((poses[kept, :3] - pose[:3]) ** 2).sum(axis=1) < apart_m**2
-        alike = (turns[kept, :, 2] @ R[:, 2] > least) & (np.abs(turns[kept, :, 1] @ R[:, 1]) > least)
-        if not (near & alike).any():
-            kept.append(n)
-            if len(kept) == most:
-                break
-    return poses[kept]
 
 
 def _torso_state(pose: Array) -> FigureState:
