@@ -304,8 +304,8 @@ def test_rows_leave_a_heap_in_order_of_their_scores():
     scores = rng.integers(0, 40, 200) / 8  # many are equal: the first comes first
     heap, order = np.zeros(200, np.int64), rng.permutation(200)
     for count, row in enumerate(order):
-        limb_kernels.push(heap, count, scores, row)
-    left = [limb_kernels.pop(heap, count, scores) for count in range(200, 0, -1)]
+        kernels.push(heap, count, scores, row)
+    left = [kernels.pop(heap, count, scores) for count in range(200, 0, -1)]
     assert left == np.argsort(scores, kind="stable").tolist()
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit
 
 from limbloc_ros.core._part_kernels import distance_to_part, lay_out
-from limbloc_ros.core._search_kernels import CHUNK, chunk_scratch, depths_at, spread_out
+from limbloc_ros.core._search_kernels import CHUNK, chunk_scratch, depths_at, pop, push, spread_out
 
 #: Ragged masks eat into limbs: a bone may be thinner than expected by this fraction of its radius at no cost.
 EATEN = 0.4
@@ -181,39 +181,6 @@ def bones_from(
         kept += ways[6, n] <= WORST
     add_explained(explained, origin, cell, start, hidden[1], explained_weight, ways, kept, scratch[1])
     return kept
-
-
-@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
-def push(heap: Any, count: int, scores: Any, new: int) -> None:
-    """Add a row to a heap of `count` rows: parents score less than their two children, or the same and come before."""
-    at = count
-    while at > 0:
-        up = (at - 1) // 2
-        if scores[heap[up]] < scores[new] or (scores[heap[up]] == scores[new] and heap[up] < new):
-            break
-        heap[at] = heap[up]
-        at = up
-    heap[at] = new
-
-
-@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
-def pop(heap: Any, count: int, scores: Any) -> int:
-    """Take the row of the least score from a heap of `count` rows; of equals the first."""
-    least = heap[0]
-    last = heap[count - 1]
-    at = 0
-    while 2 * at + 1 < count:
-        down = 2 * at + 1
-        if down + 1 < count:
-            a, b = heap[down], heap[down + 1]
-            if scores[b] < scores[a] or (scores[b] == scores[a] and b < a):
-                down += 1
-        if scores[last] < scores[heap[down]] or (scores[last] == scores[heap[down]] and last < heap[down]):
-            break
-        heap[at] = heap[down]
-        at = down
-    heap[at] = last
-    return least  # type: ignore[no-any-return]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]

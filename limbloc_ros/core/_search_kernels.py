@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Numba kernels that torso and limb search share: depth in the hull, medial axis, points spread out."""
+"""Numba kernels that torso and limb search share: depth in the hull, medial axis, points spread out, heaps."""
 
 from __future__ import annotations
 
@@ -134,3 +134,36 @@ def spread_out(points: Any, order: Any, apart: float, most: int) -> Any:
             if count == most:
                 break
     return out[:count]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def push(heap: Any, count: int, scores: Any, new: int) -> None:
+    """Add a row to a heap of `count` rows: parents score less than their two children, or the same and come before."""
+    at = count
+    while at > 0:
+        up = (at - 1) // 2
+        if scores[heap[up]] < scores[new] or (scores[heap[up]] == scores[new] and heap[up] < new):
+            break
+        heap[at] = heap[up]
+        at = up
+    heap[at] = new
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def pop(heap: Any, count: int, scores: Any) -> int:
+    """Take the row of the least score from a heap of `count` rows; of equals the first."""
+    least = heap[0]
+    last = heap[count - 1]
+    at = 0
+    while 2 * at + 1 < count:
+        down = 2 * at + 1
+        if down + 1 < count:
+            a, b = heap[down], heap[down + 1]
+            if scores[b] < scores[a] or (scores[b] == scores[a] and b < a):
+                down += 1
+        if scores[last] < scores[heap[down]] or (scores[last] == scores[heap[down]] and last < heap[down]):
+            break
+        heap[at] = heap[down]
+        at = down
+    heap[at] = last
+    return least  # type: ignore[no-any-return]

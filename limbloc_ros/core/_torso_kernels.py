@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit
 
 from limbloc_ros.core._figure_kernels import exp_so3, forward, log_so3
-from limbloc_ros.core._search_kernels import depth_at
+from limbloc_ros.core._search_kernels import depth_at, pop, push
 
 
 @njit(cache=True, inline="always", error_model="numpy")  # type: ignore[misc, unused-ignore]
@@ -95,11 +95,13 @@ def torso_from_pairs(
     """
     parents, bone_offsets, point_bones, point_offsets, point_radii = table
     out = np.empty((most, 14))
+    goodness = np.empty(most)  # less score; of the rows in a heap, the worst first
+    heap = np.empty(most, np.int64)
     count = 0
-    worst = 0
     pose = np.zeros(13)
     R = np.empty((3, 3))
     turn = np.empty(3)
+    about = np.empty((yaws, 3, 3))
     # the unit figure of each bend; every torso is one of these, turned and scaled
     unit_points = np.empty((len(bends), len(point_bones), 3))
     unit_radii = np.empty(len(point_bones))
@@ -126,6 +128,12 @@ def torso_from_pairs(
             if outside:
                 continue
             vx, vy, vz = dx / length, dy / length, dz / length
+            for y in range(yaws):
+                phi = math.pi * y / yaws
+                turn[0] = vx * phi
+                turn[1] = vy * phi
+                turn[2] = vz * phi
+                about[y] = exp_so3(turn)
             for c in range(len(bends)):
                 ax = axis_tip[c, 0] - axis_base[c, 0]
                 ay = axis_tip[c, 1] - axis_base[c, 1]
@@ -149,23 +157,23 @@ def torso_from_pairs(
                     turn[0] = math.pi
                 align = exp_so3(turn)
                 for y in range(yaws):
-                    phi = math.pi * y / yaws
-                    turn[0] = vx * phi
-                    turn[1] = vy * phi
-                    turn[2] = vz * phi
-                    T = exp_so3(turn)
                     for i in range(3):
                         for j in range(3):
-                            R[i, j] = T[i, 0] * align[0, j] + T[i, 1] * align[1, j] + T[i, 2] * align[2, j]
+                            R[i, j] = (
+                                about[y, i, 0] * align[0, j]
+                                + about[y, i, 1] * align[1, j]
+                                + about[y, i, 2] * align[2, j]
+                            )
                     for i in range(3):
                         pose[i] = pelvis_seeds[a, i] - stature * (
                             R[i, 0] * axis_base[c, 0] + R[i, 1] * axis_base[c, 1] + R[i, 2] * axis_base[c, 2]
                         )
                     clip = 0.04 * stature
-                    enough = out[worst, 13] * norm * clip * clip if count == most else math.inf
+                    full = count == most
+                    enough = -goodness[heap[0]] * norm * clip * clip if full else math.inf
                     total = 0.0
                     for n in range(len(weights)):
-                        px, py, pz = unit_points[c, n]
+                        px, py, pz = unit_points[c, n, 0], unit_points[c, n, 1], unit_points[c, n, 2]
                         e = depth_at(
                             sdf,
                             origin,
@@ -179,18 +187,16 @@ def torso_from_pairs(
                             break
                     if total >= enough:
                         continue
-                    row = worst
-                    if count < most:
-                        row = count
-                        count += 1
+                    row = pop(heap, most, goodness) if full else count
                     out[row, :3] = pose[:3]
                     out[row, 3:6] = log_so3(R)
                     out[row, 6:9] = bends[c]
                     out[row, 9:12] = 0.0
                     out[row, 12] = math.log(stature)
                     out[row, 13] = total / (norm * clip * clip)
-                    if count == most:
-                        worst = int(out[:, 13].argmax())
+                    goodness[row] = -out[row, 13]
+                    push(heap, most - 1 if full else count, goodness, row)
+                    count += not full
     return out[:count]
 
 
