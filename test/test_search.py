@@ -107,6 +107,14 @@ def test_points_are_spread_out_greedily():
     assert len(kernels.spread_out(points[:0], order[:0], 0.25, 5)) == 0
 
 
+def test_points_near_another():
+    points = np.random.default_rng(16).normal(size=(500, 4))
+    base = np.array([0.3, 0.1, -0.2])
+    expected = points[np.linalg.norm(points[:, :3] - base, axis=1) < 1.1]
+    assert 50 < len(expected) < 450
+    np.testing.assert_array_equal(kernels.points_near(points, base, 1.1), expected)
+
+
 def test_directions_cover_the_sphere_evenly():
     directions = sphere_directions(100)
     np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1)

@@ -115,6 +115,19 @@ def medial_ridge(sdf: Any, origin: Any, voxel: float, least_depth: float, flat: 
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def points_near(points: Any, base: Any, reach: float) -> Any:
+    """Of points [N, 4] those within `reach` of `base` [3]."""
+    out = np.empty((len(points), 4))
+    count = 0
+    for n in range(len(points)):
+        x, y, z = points[n, 0] - base[0], points[n, 1] - base[1], points[n, 2] - base[2]
+        for i in range(4):
+            out[count, i] = points[n, i]
+        count += x * x + y * y + z * z < reach * reach
+    return out[:count]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def spread_out(points: Any, order: Any, apart: float, most: int) -> Any:
     """Indices of points taken in `order`, each at least `apart` (m) from those before, `most` of them."""
     out = np.empty(most, np.int64)

@@ -58,6 +58,8 @@ for _child in range(N_BONES):
         SUBTREE[_ancestor, _child] = True
         _ancestor = PARENTS[_ancestor]
 
+_UNTURNED = np.tile(np.eye(3), (N_BONES, 1, 1))
+
 #: [P, 3] the spheres of each part; the last index repeats where there are fewer.
 PART_SPHERES = np.array([[SPHERE[names[min(k, len(names) - 1)]] for k in range(3)] for _, names in PARTS], np.int64)
 
@@ -193,7 +195,7 @@ class FigureState:
     @staticmethod
     def standing(root: Array, heading: float = 0.0, stature: float = 1.7) -> FigureState:
         """A person of mean proportions who stands with hanging arms and looks along `heading` (rad about z)."""
-        rotations = np.tile(np.eye(3), (N_BONES, 1, 1))
+        rotations = _UNTURNED.copy()
         rotations[0] = kernels.exp_so3(np.array([0.0, 0.0, heading]))
         shape = np.zeros(proportions().n_shape)
         shape[0] = np.log(stature)

@@ -206,7 +206,9 @@ def _open_question(
     w: Weights,
     views: Views | None,
 ) -> _OpenQuestion:
-    body = np.setdiff1d(body, np.concatenate([_limb_table(kind, side).parts for side in sides]))
+    stays = np.ones(figure.N_PARTS, np.bool_)
+    stays[np.concatenate([_limb_table(kind, side).parts for side in sides])] = False
+    body = body[stays[body]]
     surface = np.array([w.surface_width_m, w.normal_gate_m, w.surface_inside])
     scene = (evidence.points, evidence.normals, evidence.rays)
     gap, costs = kernels.body_fit(*scene, figure.PART_SPHERES[body], placed.spheres, placed.radii, surface)

@@ -198,8 +198,9 @@ def _scores(poses: Array, views: Views | None) -> Array:
 def _torso_state(pose: Array) -> FigureState:
     state = FigureState.standing(pose[:3], stature=float(np.exp(pose[12])))
     state.rotations[0] = exp_so3(pose[3:6])
+    third = exp_so3(pose[6:9] / 3)
     for bone in ("abdomen", "thorax", "chest"):
-        state.rotations[BONE[bone]] = exp_so3(pose[6:9] / 3)
+        state.rotations[BONE[bone]] = third
     state.rotations[BONE["head"]] = exp_so3(pose[9:12])
     return state
 
@@ -302,7 +303,7 @@ def limb_candidates(
     # thighs do not point up the back or far across the other side
     no_go = -outward if kind is ARM else (-pelvis[:, 0] + 0.6 * pelvis[:, 2] - 0.4 * outward)
     forbidden = np.append(no_go / np.linalg.norm(no_go), 0.97 if kind is ARM else 0.6)
-    near = medial.points[((medial.points[:, :3] - base) ** 2).sum(axis=1) < (1.2 * lengths.sum()) ** 2]
+    near = kernels.points_near(medial.points, base, 1.2 * lengths.sum())
     if len(near) > 500:
         near = near[:: len(near) // 500 + 1]
     found = limb_kernels.search_limb(
