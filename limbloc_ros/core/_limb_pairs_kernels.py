@@ -319,19 +319,27 @@ def best_pairs(
     """
     out = np.empty((len(left_rows) * len(right_rows), 3))
     nq = len(body_costs)
+    # Point by point for all limbs of the other side at once: each sum in its order, and vector code all the same.
+    count = len(right_rows)
+    near = np.empty((nq, count))
+    price = np.empty((nq, count))
+    totals = np.empty(count)
+    for m in range(count):
+        for q in range(nq):
+            near[q, m] = right_gaps[right_rows[m], q]
+            price[q, m] = right_costs[right_rows[m], q]
     n = 0
     for a in left_rows:
-        for b in right_rows:
+        totals[:] = 0.0
+        for q in range(nq):
+            ga = left_gaps[a, q]
+            other = left_costs[a, q] if ga < math.inf else body_costs[q]
+            for m in range(count):
+                totals[m] += price[q, m] if near[q, m] < ga else other
+        for m in range(count):
+            b = right_rows[m]
             cost = left_own[a] + right_own[b]
-            total = 0.0
-            for q in range(nq):
-                ga = left_gaps[a, q]
-                gb = right_gaps[b, q]
-                c = body_costs[q]
-                c = left_costs[a, q] if ga < math.inf else c
-                c = right_costs[b, q] if gb < ga else c
-                total += c
-            cost += point_weight * total
+            cost += point_weight * totals[m]
             for first in (0, 3):
                 d = 0.0
                 for i in range(3):
