@@ -104,13 +104,14 @@ def explain(
         found = -1
         if least_of[0, q] <= best:
             x, y, z = scene[0, q], scene[1, q], scene[2, q]
+            ray = (scene[3, q], scene[4, q], scene[5, q])
             likely = int(least_of[1, q])
             for n in range(-1, len(parts)):
                 p = likely if n < 0 else n
                 if n == likely or least_of[2 + p, q] > best:
                     continue
                 _, d, wb, wc = gated_distance(
-                    rows[p], x, y, z, rays[q], scene[6, q], scene[7, q], scene[8, q], surface[1]
+                    rows[p], x, y, z, ray, scene[6, q], scene[7, q], scene[8, q], surface[1]
                 )  # fmt: skip
                 if d < best or (d == best and p < found):
                     best = d
