@@ -23,6 +23,7 @@ from limbloc_ros.simulation.surroundings import HALF_M, HEIGHT_M, Backdrop, back
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 Mask = NDArray[np.uint8]
+Box = tuple[int, int, int, int]  # x0, y0, x1, y1, the ends left out
 
 _LIGHT = np.array([0.35, -0.25, 0.9]) / np.linalg.norm([0.35, -0.25, 0.9])
 _CELL_M = 0.02
@@ -79,6 +80,7 @@ class _Instant:
     t: float
     lit: tuple[_Lit, ...]
     floor_light: NDArray[np.float32]  # [h, w] of cells
+    floor_dark: Mask  # [h, w] where the light between a cell and the next ones is less than 1
     floor_cell: tuple[int, int]  # x, y of its first cell
 
 
@@ -89,6 +91,10 @@ class _View:
         self.camera = camera
         self.index = index
         self.empty = scenery.image
+        # What was drawn last, without noise, and its silhouette; where they are not those of `empty`.
+        self.scene = scenery.image.copy()
+        self.mask = np.zeros((camera.height, camera.width), np.uint8)
+        self.touched: list[Box] = []
         self.floor = np.nan_to_num((scenery.floor_m + HALF_M) / _CELL_M, nan=-1e6).astype(np.float32)
         self.T_camera_world = camera.T_camera_world
         self.zbuffer = np.zeros((camera.height, camera.width), np.float32)
@@ -97,6 +103,13 @@ class _View:
         if camera.distortion_model != "fisheye" and camera.distortion.size <= 8:
             self._coefficients = np.zeros(8)
             self._coefficients[: camera.distortion.size] = camera.distortion
+
+    def clear(self) -> None:
+        """Make the room empty again."""
+        for x0, y0, x1, y1 in self.touched:
+            self.scene[y0:y1, x0:x1] = self.empty[y0:y1, x0:x1]
+            self.mask[y0:y1, x0:x1] = 0
+        self.touched.clear()
 
     def project(self, points: Array) -> tuple[Array, Array]:
         """The same as Camera.world_to_image, several times faster for the usual distortion models."""
@@ -185,9 +198,30 @@ class SimulatedRoom:
         found = [motion.pose(t) for motion in (self.motion, *self.others)]
         return [None if posed is None else posed.joints.copy() for posed in found]
 
-    def render(self, camera_name: str, t: float) -> Image:
-        """The image uint8 [height, width, 3] bgr of one camera at time t s; the same as in `frame`."""
-        return self.render_with_mask(camera_name, t)[0]
+    def render(self, camera_name: str, t: float, out: Image | None = None) -> Image:
+        """The image uint8 [height, width, 3] bgr of one camera at time t s; the same as in `frame`.
+
+        Args:
+            camera_name: one of the rig's.
+            t: s since the start.
+            out: the image is put there, and nothing is allocated; contiguous.
+
+        Raises:
+            RigError: no such camera.
+        """
+        view = self._view(camera_name)
+        view.clear()
+        instant = self._instant_at(t)
+        if instant is not None:
+            self._draw_shadow(view, instant)
+            self._draw(view, instant)
+        if out is None:
+            out = np.empty_like(view.scene)
+        place = [self.seed, view.index, round(t * 1e6) & 0xFFFFFFFF]
+        key = np.random.SeedSequence(place).generate_state(1, np.uint64)[0]
+        rows = view.camera.height, -1
+        kernels.expose(view.scene.reshape(rows), self._gain(t, view.index), self._noise, key, out.reshape(rows))
+        return out
 
     def render_with_mask(self, camera_name: str, t: float) -> tuple[Image, Mask]:
         """Image and true silhouette (255 = person) of one camera at time t s.
@@ -195,20 +229,7 @@ class SimulatedRoom:
         Raises:
             RigError: no such camera.
         """
-        view = self._view(camera_name)
-        height, width = view.camera.height, view.camera.width
-        mask = np.zeros((height, width), np.uint8)
-        clean = view.empty
-        instant = self._instant_at(t)
-        if instant is not None:
-            clean = view.empty.copy()
-            self._draw_shadow(view, instant, clean)
-            self._draw(view, instant, clean, mask)
-        out = np.empty((height, width * 3), np.uint8)
-        place = [self.seed, view.index, round(t * 1e6) & 0xFFFFFFFF]
-        key = np.random.SeedSequence(place).generate_state(1, np.uint64)[0]
-        kernels.expose(clean.reshape(height, -1), self._gain(t, view.index), self._noise, key, out)
-        return out.reshape(height, width, 3), mask
+        return self.render(camera_name, t), self._view(camera_name).mask.copy()
 
     def warm_up(self) -> None:
         """Compile or load every kernel and look at the empty room, so that the first images are not late."""
@@ -234,7 +255,8 @@ class SimulatedRoom:
         if not lit:
             return None
         light, cell = self._floor_light(*_joined(lit))
-        self._instant = _Instant(t, lit, light, cell)
+        dark = cv2.dilate((light < 1).view(np.uint8), np.ones((2, 2), np.uint8), anchor=(0, 0))
+        self._instant = _Instant(t, lit, light, dark, cell)
         return self._instant
 
     def _lit(self, t: float) -> tuple[_Lit, ...]:
@@ -276,7 +298,7 @@ class SimulatedRoom:
         (y0, x0), (y1, x1) = np.maximum(dark.min(axis=0) - 1, 0), dark.max(axis=0) + 2
         return np.ascontiguousarray(light[y0:y1, x0:x1]), (int(low[0] + x0), int(low[1] + y0))
 
-    def _draw_shadow(self, view: _View, instant: _Instant, image: Image) -> None:
+    def _draw_shadow(self, view: _View, instant: _Instant) -> None:
         h, w = instant.floor_light.shape
         x0, y0 = instant.floor_cell
         ground = np.zeros((len(_RIM), 3))
@@ -285,9 +307,10 @@ class SimulatedRoom:
         whole = 0, 0, view.camera.width, view.camera.height
         box = whole if np.isnan(uv).any() else _image_box(uv, depth, -np.inf, view.camera)
         if box is not None:
-            kernels.darken_floor(image, view.floor, instant.floor_light, x0, y0, *box)
+            view.touched.append(box)
+            kernels.darken_floor(view.scene, view.floor, instant.floor_light, instant.floor_dark, x0, y0, *box)
 
-    def _draw(self, view: _View, instant: _Instant, image: Image, mask: Mask) -> None:
+    def _draw(self, view: _View, instant: _Instant) -> None:
         seen = []
         for lit in instant.lit:
             uv, depth = view.project(lit.vertices)
@@ -298,13 +321,14 @@ class SimulatedRoom:
             return
         boxes = np.array([box for *_, box in seen])
         (x0, y0), (x1, y1) = boxes[:, :2].min(axis=0), boxes[:, 2:].max(axis=0)
+        view.touched.append((x0, y0, x1, y1))
         view.zbuffer[y0:y1, x0:x1] = 0.0
         for lit, uv, depth, box in seen:
             kernels.rasterise(
                 uv, depth, lit.faces, lit.shade, lit.garments, lit.stripe, lit.palette, _NEAR_M,
-                image, mask, view.zbuffer, *box,
+                view.scene, view.mask, view.zbuffer, *box,
             )  # fmt: skip
-        kernels.soften_edges(image, image[y0:y1, x0:x1].copy(), mask, x0, y0, x1, y1)
+        kernels.soften_edges(view.scene, view.scene[y0:y1, x0:x1].copy(), view.mask, x0, y0, x1, y1)
 
 
 def _palette(person: Person) -> Array:
@@ -333,7 +357,7 @@ def _joined(lit: Sequence[_Lit]) -> tuple[Array, NDArray[np.int32]]:
     return np.concatenate([each.vertices for each in lit]), np.concatenate(faces)
 
 
-def _image_box(uv: Array, depth: Array, near: float, camera: Camera) -> tuple[int, int, int, int] | None:
+def _image_box(uv: Array, depth: Array, near: float, camera: Camera) -> Box | None:
     """x0, y0, x1, y1 within the image, with a margin, around the points deeper than `near` m; None for no point."""
     some, u0, v0, u1, v1 = kernels.bounds(uv, depth, near)
     if not some:
