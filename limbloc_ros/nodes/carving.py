@@ -18,13 +18,14 @@ from std_msgs.msg import Header
 from limbloc_ros.core.camera import Rig
 from limbloc_ros.core.config import HullConfig, SyncConfig, setting
 from limbloc_ros.core.errors import InputError, NoPerson
-from limbloc_ros.core.images import Pixels
+from limbloc_ros.core.images import Pixels, message_to_mask
 from limbloc_ros.core.pipeline import Carver
 from limbloc_ros.core.synchroniser import FrameSet, StampSynchroniser
-from limbloc_ros.ros import cloud_messages, image_messages, node_main, topics
+from limbloc_ros.ros import cloud_messages, node_main, topics
 from limbloc_ros.ros.backlog import Backlog
 from limbloc_ros.ros.carving_report import CarvingReport
 from limbloc_ros.ros.health import Health
+from limbloc_ros.ros.image_cdr import read_sent
 from limbloc_ros.ros.messages import make_header, message_to_joints, stamp_ns
 from limbloc_ros.ros.parameters import NodeParameters
 from limbloc_ros.ros.rig_source import RigFromTopics, rig_from_file
@@ -86,9 +87,9 @@ class CarvingNode(Node):
         mask_topics = {name: self.mask_topic(name) for name in s.cameras or (self.rig.names if self.rig else ())}
         self.report = CarvingReport(self, mask_topics)
         self.health = Health(self, self.describe)
-        kind = Image if s.mask_transport == "raw" else CompressedImage
+        self.kind = Image if s.mask_transport == "raw" else CompressedImage
         for name, topic in mask_topics.items():
-            self.create_subscription(kind, topic, self.make_callback(name), topics.WORK_QOS)
+            self.create_subscription(self.kind, topic, self.make_callback(name), topics.WORK_QOS, raw=True)
         self.create_subscription(Header, topics.FRAMES_SKIPPED, self.on_skipped, topics.STREAM_QOS)
         # A pose node that died cannot say so; whose hulls are not answered can.
         self.create_subscription(PoseArray, topics.JOINTS, self.on_joints, topics.STREAM_QOS)
@@ -111,23 +112,24 @@ class CarvingNode(Node):
         self.backlog.clear()
         self.get_logger().info(f"carving with {len(rig.cameras)} cameras: {', '.join(rig.names)}")
 
-    def make_callback(self, camera: str) -> Callable[[Image | CompressedImage], None]:
+    def make_callback(self, camera: str) -> Callable[[bytes], None]:
         """The subscription callback of one camera."""
-        return lambda msg: self.on_mask(camera, msg)
+        return lambda cdr: self.on_mask(camera, cdr)
 
-    def on_mask(self, camera: str, msg: Image | CompressedImage) -> None:
+    def on_mask(self, camera: str, cdr: bytes) -> None:
         """One mask: into the synchroniser, and what that finishes into the backlog."""
         if self.rig is None or self.synchroniser is None or camera not in self.rig.names:
             return  # the diagnostics say what is missing of the rig
         with self.health.guard(f"camera {camera}"):
-            mask = image_messages.message_to_mask(msg)
+            sent = read_sent(self.kind, cdr)
+            mask = message_to_mask(sent)
             expected = self.rig.camera(camera)
             if mask.shape != (expected.height, expected.width):
                 raise InputError(
                     f"expected a mask of {expected.width}x{expected.height} px as in the rig, got "
                     f"{mask.shape[1]}x{mask.shape[0]}; is the stream scaled, or the rig another camera's?"
                 )
-            stamp = stamp_ns(msg.header)
+            stamp = sent.stamp_ns
             self.report.mask(camera, mask, stamp, self.health.latency_s(stamp))
             self.put_by(self.synchroniser.add(camera, stamp, mask, time.monotonic_ns()))
 

@@ -26,6 +26,7 @@ from limbloc_ros.recordings.videos import pictures_in, read_picture
 from limbloc_ros.ros import image_messages, node_main, topics
 from limbloc_ros.ros.backlog import Backlog, Thinning
 from limbloc_ros.ros.health import SILENT_S, WINDOW_S, Health, Meter
+from limbloc_ros.ros.image_cdr import SentCompressed, SentImage, mask_cdr, read_sent
 from limbloc_ros.ros.messages import ERROR, NANOSECONDS, OK, WARN, make_header, make_status, stamp_ns
 from limbloc_ros.ros.parameters import NodeParameters
 
@@ -91,7 +92,7 @@ class SegmentationNode(Node):
         self.meter = Meter()
         self.segment_ms = float("nan")
         self.thinning = Thinning()
-        self.backlog: Backlog[Image | CompressedImage] = Backlog(
+        self.backlog: Backlog[SentImage | SentCompressed] = Backlog(
             self, self.segment, self.settings.catch_up_s, self.tell_others
         )
         self.skips = self.create_publisher(Header, topics.FRAMES_SKIPPED, topics.STREAM_QOS)
@@ -102,21 +103,22 @@ class SegmentationNode(Node):
         self.health = Health(self, self.describe)
         qos = topics.image_subscription(self.settings.reliability)
         if self.settings.transport == "raw":
-            self.topic, kind = topics.image(camera), Image
+            self.topic, self.kind = topics.image(camera), Image
         else:
-            self.topic, kind = topics.image_compressed(camera), CompressedImage
+            self.topic, self.kind = topics.image_compressed(camera), CompressedImage
         self.restore_background()
-        self.create_subscription(kind, self.topic, self.on_image, qos)
+        self.create_subscription(self.kind, self.topic, self.on_image, qos, raw=True)
         self.create_service(Trigger, topics.RECAPTURE_BACKGROUND, self.on_recapture)
         self.create_service(SetBool, topics.FREEZE_BACKGROUND, self.on_freeze)
 
-    def on_image(self, msg: Image | CompressedImage) -> None:
+    def on_image(self, cdr: bytes) -> None:
         """One image: into the backlog."""
-        stamp = stamp_ns(msg.header)
-        if self.thinning.takes(stamp):
-            self.backlog.add(stamp, msg)
-        else:
-            self.backlog.left_out()
+        with self.health.guard(f"camera {self.settings.camera}"):
+            sent = read_sent(self.kind, cdr)
+            if self.thinning.takes(sent.stamp_ns):
+                self.backlog.add(sent.stamp_ns, sent)
+            else:
+                self.backlog.left_out()
 
     def tell_others(self, stamp: int) -> None:
         """We skipped our images up to this stamp (ns): without them the other cameras' are worth little."""
@@ -128,12 +130,12 @@ class SegmentationNode(Node):
         self.thinning.announced(stamp)
         self.backlog.skip_until(stamp)
 
-    def segment(self, msg: Image | CompressedImage) -> None:
+    def segment(self, sent: SentImage | SentCompressed) -> None:
         """Segment one image, publish its mask with the image's stamp and frame."""
         started = time.thread_time()
         with self.health.guard(f"camera {self.settings.camera}"):
-            pixels = image_messages.message_to_pixels(msg)
-            stamp, relit = stamp_ns(msg.header), self.model.relit
+            pixels = image_messages.message_to_pixels(sent)
+            stamp, relit = sent.stamp_ns, self.model.relit
             self.watch_for_freeze(pixels, stamp)
             self.last = self.model.segment(pixels)
             if self.model.relit > relit:
@@ -143,9 +145,9 @@ class SegmentationNode(Node):
                 return  # an old silhouette, or half of one, would cut the hull of who is there
             always = self.settings.publish == "always"
             if always or self.raw_mask.get_subscription_count():
-                self.raw_mask.publish(image_messages.mask_to_image(self.last.mask, msg.header))
+                self.raw_mask.publish(image_messages.mask_to_image(self.last.mask, make_header(stamp, sent.frame_id)))
             if always or self.png_mask.get_subscription_count():
-                self.png_mask.publish(image_messages.mask_to_compressed(self.last.mask, msg.header))
+                self.png_mask.publish(mask_cdr(self.last.mask, stamp, sent.frame_id))
             self.save_background()
             self.segment_ms = 1e3 * (time.thread_time() - started)
 

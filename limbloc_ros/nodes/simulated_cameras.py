@@ -23,7 +23,8 @@ from limbloc_ros.core.errors import ConfigError
 from limbloc_ros.rig.rig_file import load_rig, save_rig
 from limbloc_ros.ros import node_main, topics
 from limbloc_ros.ros.health import Health, Meter
-from limbloc_ros.ros.image_messages import camera_to_info, pixels_to_compressed, pixels_to_image
+from limbloc_ros.ros.image_cdr import ImageCdr, StampedCdr
+from limbloc_ros.ros.image_messages import camera_to_info, pixels_to_compressed
 from limbloc_ros.ros.messages import (
     NANOSECONDS,
     OK,
@@ -37,7 +38,6 @@ from limbloc_ros.ros.parameters import NodeParameters
 from limbloc_ros.ros.transforms import TransformOutput
 from limbloc_ros.simulation.company import MOST, TOGETHER, chair, company
 from limbloc_ros.simulation.ring import default_rig
-from limbloc_ros.simulation.room import Image as Image8
 from limbloc_ros.simulation.room import SimulatedRoom
 
 #: Looks a frame: whether it is time to draw the next one, or to send it.
@@ -123,9 +123,10 @@ class SimulatedCamerasNode(Node):
             for n in range(1, s.people + 1)
             if self.tells_truth
         ]
-        # Only the stamps change; making the whole message anew costs more than sending it.
+        # Only stamps and pixels change; making the whole messages anew costs more than sending them.
+        self.images = {c.name: ImageCdr(c.height, c.width, topics.optical_frame(c.name)) for c in self.cameras}
         self.info_messages = {
-            c.name: camera_to_info(c, make_header(0, topics.optical_frame(c.name))) for c in self.cameras
+            c.name: StampedCdr(camera_to_info(c, make_header(0, topics.optical_frame(c.name)))) for c in self.cameras
         }
         self.transforms = TransformOutput(self, static=True)
         self.transforms.send(
@@ -142,7 +143,7 @@ class SimulatedCamerasNode(Node):
             self.start_ns = round(s.start_s * NANOSECONDS) // self.period_ns * self.period_ns
         self.made_s = time.monotonic()
         self.last_frame, self.skipped = -1, 0
-        self.rendered: tuple[int, dict[str, Image8]] = (-1, {})
+        self.rendered: tuple[int, list[str]] = (-1, [])  # a frame, and the cameras whose `images` show it
         self.tick_ns = self.period_ns // TICKS
         self.create_timer(self.tick_ns / NANOSECONDS, self.on_timer, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
@@ -170,7 +171,9 @@ class SimulatedCamerasNode(Node):
         """Draw what the watched cameras see in a frame."""
         started, t = time.thread_time(), frame * self.period_ns / NANOSECONDS
         watched = [c.name for c in self.cameras if _watched(self.raw.get(c.name)) or _watched(self.jpeg.get(c.name))]
-        self.rendered = frame, {name: self.room.render(name, t) for name in watched}
+        for name in watched:
+            self.room.render(name, t, self.images[name].pixels)
+        self.rendered = frame, watched
         self.render_ms = 1e3 * (time.thread_time() - started)
 
     def _is_watched(self) -> bool:
@@ -187,17 +190,16 @@ class SimulatedCamerasNode(Node):
         if self.rendered[0] != frame:
             self.render(frame)
         for camera in self.cameras:
-            header = make_header(stamp, topics.optical_frame(camera.name))
-            self.info_messages[camera.name].header = header
-            self.infos[camera.name].publish(self.info_messages[camera.name])
-            pixels = self.rendered[1].get(camera.name)
-            if pixels is None:
+            self.infos[camera.name].publish(self.info_messages[camera.name].stamped(stamp))
+            if camera.name not in self.rendered[1]:
                 continue
+            image = self.images[camera.name]
             raw, jpeg = _watched(self.raw.get(camera.name)), _watched(self.jpeg.get(camera.name))
             if raw is not None:
-                raw.publish(pixels_to_image(pixels, header))
+                raw.publish(image.stamped(stamp))
             if jpeg is not None:
-                jpeg.publish(pixels_to_compressed(pixels, header, self.settings.jpeg_quality))
+                header = make_header(stamp, topics.optical_frame(camera.name))
+                jpeg.publish(pixels_to_compressed(image.pixels, header, self.settings.jpeg_quality))
         if self.truth:
             header = make_header(stamp, self.settings.world_frame)
             for publisher, joints in zip(self.truth, self.room.everybodys_joints(t), strict=True):

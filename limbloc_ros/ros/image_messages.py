@@ -27,6 +27,7 @@ from limbloc_ros.core.images import (
 from limbloc_ros.core.mask_png import encode_mask
 
 __all__ = [
+    "MASK_FORMAT",
     "camera_to_info",
     "compressed_to_pixels",
     "image_to_pixels",
@@ -38,6 +39,9 @@ __all__ = [
     "pixels_to_compressed",
     "pixels_to_image",
 ]
+
+#: As image_transport names it.
+MASK_FORMAT = "mono8; png compressed mono8"
 
 
 def pixels_to_image(pixels: Pixels, header: Header) -> Image:
@@ -70,7 +74,7 @@ def mask_to_image(mask: Pixels, header: Header) -> Image:
 
 def mask_to_compressed(mask: Pixels, header: Header) -> CompressedImage:
     """uint8 [height, width], non-zero = foreground -> PNG of one bit per pixel, about 1 KB for a person."""
-    return CompressedImage(header=header, format="mono8; png compressed mono8", data=array("B", encode_mask(mask)))
+    return CompressedImage(header=header, format=MASK_FORMAT, data=array("B", encode_mask(mask)))
 
 
 _MODELS = {"none": "plumb_bob", "radtan": "plumb_bob", "rational": "rational_polynomial", "fisheye": "equidistant"}
