@@ -24,8 +24,8 @@ from limbloc_ros.core.synchroniser import FrameSet, StampSynchroniser
 from limbloc_ros.ros import cloud_messages, node_main, topics
 from limbloc_ros.ros.backlog import Backlog
 from limbloc_ros.ros.carving_report import CarvingReport
+from limbloc_ros.ros.cdr import read_sent
 from limbloc_ros.ros.health import Health
-from limbloc_ros.ros.image_cdr import read_sent
 from limbloc_ros.ros.messages import make_header, message_to_joints, stamp_ns
 from limbloc_ros.ros.parameters import NodeParameters
 from limbloc_ros.ros.rig_source import RigFromTopics, rig_from_file

@@ -28,6 +28,7 @@ from limbloc_ros.core.synchroniser import JUMP_S
 from limbloc_ros.ros import messages, node_main, topics
 from limbloc_ros.ros.backlog import Backlog
 from limbloc_ros.ros.body_output import BodiesOutput
+from limbloc_ros.ros.cdr import joints_cdr
 from limbloc_ros.ros.cloud_messages import cloud_to_hull, surface_to_cloud, warm_up
 from limbloc_ros.ros.health import SILENT_S, Health, Meter
 from limbloc_ros.ros.messages import NANOSECONDS, OK, WARN, make_status, stamp_ns
@@ -142,7 +143,7 @@ class PoseNode(Node):
         found = {body.number: body.outcome for body in self.seen if isinstance(body.outcome, Pose)}
         trusted = {n: pose for n, pose in found.items() if pose.reliable or self.settings.publish_unreliable}
         first = trusted.get(self.seen[0].number)
-        self.joints.publish(messages.joints_to_message(None if first is None else first.joints, header))
+        self.joints.publish(joints_cdr(None if first is None else first.joints, stamp_ns(header), header.frame_id))
         if first is not None:
             self.angles.publish(messages.angles_to_message(first.angles, header))
         self.bodies.publish(trusted, header, self.settings.urdf_tolerance_m, self.settings.urdf_period_s)

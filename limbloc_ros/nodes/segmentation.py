@@ -25,8 +25,8 @@ from limbloc_ros.recordings.background_file import load_background, save_backgro
 from limbloc_ros.recordings.videos import pictures_in, read_picture
 from limbloc_ros.ros import image_messages, node_main, topics
 from limbloc_ros.ros.backlog import Backlog, Thinning
+from limbloc_ros.ros.cdr import SentCompressed, SentImage, mask_cdr, read_sent
 from limbloc_ros.ros.health import SILENT_S, WINDOW_S, Health, Meter
-from limbloc_ros.ros.image_cdr import SentCompressed, SentImage, mask_cdr, read_sent
 from limbloc_ros.ros.messages import ERROR, NANOSECONDS, OK, WARN, make_header, make_status, stamp_ns
 from limbloc_ros.ros.parameters import NodeParameters
 

@@ -22,14 +22,13 @@ from limbloc_ros.core.config import setting
 from limbloc_ros.core.errors import ConfigError
 from limbloc_ros.rig.rig_file import load_rig, save_rig
 from limbloc_ros.ros import node_main, topics
+from limbloc_ros.ros.cdr import ImageCdr, StampedCdr, joints_cdr
 from limbloc_ros.ros.health import Health, Meter
-from limbloc_ros.ros.image_cdr import ImageCdr, StampedCdr
 from limbloc_ros.ros.image_messages import camera_to_info, pixels_to_compressed
 from limbloc_ros.ros.messages import (
     NANOSECONDS,
     OK,
     WARN,
-    joints_to_message,
     make_header,
     make_status,
     transform_to_message,
@@ -201,9 +200,8 @@ class SimulatedCamerasNode(Node):
                 header = make_header(stamp, topics.optical_frame(camera.name))
                 jpeg.publish(pixels_to_compressed(image.pixels, header, self.settings.jpeg_quality))
         if self.truth:
-            header = make_header(stamp, self.settings.world_frame)
             for publisher, joints in zip(self.truth, self.room.everybodys_joints(t), strict=True):
-                publisher.publish(joints_to_message(joints, header))
+                publisher.publish(joints_cdr(joints, stamp, self.settings.world_frame))
         self.meter.tick(self.health.latency_s(stamp))
 
     def describe(self) -> Sequence[DiagnosticStatus]:

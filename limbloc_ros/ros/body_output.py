@@ -20,10 +20,10 @@ from limbloc_ros.core.pose import Pose
 from limbloc_ros.core.posture import POSTURES, posture_of
 from limbloc_ros.core.ros4hri import ros4hri
 from limbloc_ros.ros import topics
+from limbloc_ros.ros.cdr import joints_cdr
 from limbloc_ros.ros.messages import (
     NANOSECONDS,
     angles_to_message,
-    joints_to_message,
     stamp_ns,
     transform_to_message,
 )
@@ -127,7 +127,7 @@ class BodyOutput:
             self._urdf.publish(String(data=self._description))
             self._native_urdf.publish(String(data=native_urdf(pose, self._id)))
         if self._joints.get_subscription_count():
-            self._joints.publish(joints_to_message(pose.joints, header))
+            self._joints.publish(joints_cdr(pose.joints, stamp, header.frame_id))
         if self._native.get_subscription_count():
             self._native.publish(angles_to_message(pose.angles, header))
         self._angles = ros4hri(pose, self._angles)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Images as they are sent, read and written without rclpy: against what rclpy makes of them, cut at every byte."""
+"""Messages as they are sent, read and written without rclpy: against what rclpy makes of them, cut at every byte."""
 
 from __future__ import annotations
 
@@ -7,12 +7,14 @@ from array import array
 
 import numpy as np
 import pytest
+from geometry_msgs.msg import PoseArray
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from limbloc_ros.core.errors import InputError
+from limbloc_ros.core.pose import JOINT_NAMES
 from limbloc_ros.ros import messages
-from limbloc_ros.ros.image_cdr import ImageCdr, SentCompressed, SentImage, StampedCdr, mask_cdr, read_sent
+from limbloc_ros.ros.cdr import ImageCdr, SentCompressed, SentImage, StampedCdr, joints_cdr, mask_cdr, read_sent
 from limbloc_ros.ros.image_messages import mask_to_compressed, message_to_mask, message_to_pixels, pixels_to_image
 
 STAMP = 1_700_000_000_123_456_789
@@ -56,6 +58,16 @@ def test_a_mask_is_written_as_rclpy_writes_it_and_read_as_it_was(frame: str) -> 
     assert isinstance(sent, SentCompressed)
     assert (sent.stamp_ns, sent.frame_id, sent.format) == (STAMP, frame, msg.format)
     np.testing.assert_array_equal(message_to_mask(sent), mask)
+
+
+@pytest.mark.parametrize("frame", [*FRAMES, "room", "room1", "room12", "room123"])
+def test_joints_are_written_as_rclpy_writes_them(frame: str) -> None:
+    joints = np.random.default_rng(0).normal(size=(len(JOINT_NAMES), 3))
+    for found in (joints, None):
+        cdr = joints_cdr(found, STAMP, frame)
+        msg = messages.joints_to_message(found, messages.make_header(STAMP, frame))
+        assert deserialize_message(cdr, PoseArray) == msg
+        assert len(cdr) == len(serialize_message(msg))
 
 
 def test_either_byte_order_is_read() -> None:
