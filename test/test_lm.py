@@ -6,6 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from limbloc_ros.core._lm_kernels import damped_step
 from limbloc_ros.core.figure import kernels
 from limbloc_ros.core.lm import System, minimise
 
@@ -30,6 +31,21 @@ def rosenbrock(x):
 
 def rosenbrock_jacobian(x):
     return np.array([[-20 * x[0], 10.0], [-1.0, 0.0]])
+
+
+@pytest.mark.parametrize("size", [1, 2, 7, 81])
+def test_the_damped_step_against_lapack(size):
+    rng = np.random.default_rng(size)
+    rows = rng.normal(size=(size // 2 + 1, size)) * np.exp(3 * rng.normal(size=size))  # of half the rank
+    matrix, gradient = rows.T @ rows, rng.normal(size=len(rows)) @ rows
+    for damping in (1e-4, 1e-2, 10.0):
+        diagonal = np.maximum(matrix.diagonal(), 1e-6 * matrix.diagonal().max())
+        expected = -np.linalg.solve(matrix + damping * np.diag(diagonal), gradient)
+        scale = np.sqrt(diagonal)  # parameters have units of their own
+        np.testing.assert_allclose(
+            damped_step(matrix, gradient, damping) * scale, expected * scale, rtol=1e-6, atol=1e-9
+        )
+    assert not damped_step(np.zeros((size, size)), np.zeros(size), 1e-2).any()
 
 
 @pytest.mark.parametrize("start", [(-1.2, 1.0), (0.0, 0.0), (3.0, -4.0)])

@@ -10,6 +10,8 @@ from typing import Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from limbloc_ros.core._lm_kernels import damped_step
+
 Array = NDArray[np.float64]
 State = TypeVar("State")
 
@@ -76,10 +78,7 @@ def minimise(
     count = 0
     while count < iterations:
         count += 1
-        diagonal = system.matrix.diagonal()
-        damped = system.matrix.copy()
-        damped.flat[:: len(damped) + 1] += damping * np.maximum(diagonal, 1e-6 * diagonal.max() + 1e-12)
-        step = np.asarray(-np.linalg.solve(damped, system.gradient), np.float64)
+        step = np.asarray(damped_step(system.matrix, system.gradient, damping), np.float64)
         if largest_step is not None:
             step /= max(1.0, float((np.abs(step) / largest_step).max()))
         trial_state = retract(state, step)
