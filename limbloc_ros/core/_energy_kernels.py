@@ -152,7 +152,7 @@ def inclusion_term(
         cost += weight * c
         for i in range(3):
             away[i] = -grad[i]
-        add_block(blocks[p], slopes[p], samples[m], away, e, weight * wd)
+        add_block(blocks, slopes, p, samples, m, away, e, weight * wd)
         add_bending(sdf, origin, voxel, x, y, z, depth, samples[m], weight * wd * e, blocks[p])
     return cost
 
@@ -165,30 +165,30 @@ def gather(blocks: Any, slopes: Any, parts: Any, J: Any, A: Any, g: Any) -> None
     sphere, and all inner loops run along rows, for the processor to take several parameters at a time.
     """
     n = A.shape[0]
+    end = np.uint64(n)  # of numbers that may be negative the compiler makes no vectors
     pushed = np.zeros(J.shape)
     force = np.zeros((len(J), 4))
     touched = np.zeros(len(J), np.bool_)
     for p in range(len(parts)):
-        block = blocks[p]
         for k in range(3):
-            if block[4 * k + 3, 4 * k + 3] == 0.0:
+            if blocks[p, 4 * k + 3, 4 * k + 3] == 0.0:
                 continue
             s = parts[p, k]
             touched[s] = True
             for i in range(4):
                 force[s, i] += slopes[p, 4 * k + i]
             for m in range(3):
-                if block[4 * m + 3, 4 * m + 3] == 0.0:
+                if blocks[p, 4 * m + 3, 4 * m + 3] == 0.0:
                     continue
                 q = parts[p, m]
                 for i in range(4):
                     a = 4 * k + i
                     b = 4 * m
                     if k <= m:
-                        b0, b1, b2, b3 = block[a, b], block[a, b + 1], block[a, b + 2], block[a, b + 3]
+                        b0, b1, b2, b3 = blocks[p, a, b], blocks[p, a, b + 1], blocks[p, a, b + 2], blocks[p, a, b + 3]
                     else:
-                        b0, b1, b2, b3 = block[b, a], block[b + 1, a], block[b + 2, a], block[b + 3, a]
-                    for j in range(n):
+                        b0, b1, b2, b3 = blocks[p, b, a], blocks[p, b + 1, a], blocks[p, b + 2, a], blocks[p, b + 3, a]
+                    for j in range(end):
                         pushed[s, i, j] += b0 * J[q, 0, j] + b1 * J[q, 1, j] + b2 * J[q, 2, j] + b3 * J[q, 3, j]
     for s in range(len(J)):
         if not touched[s]:
@@ -198,7 +198,7 @@ def gather(blocks: Any, slopes: Any, parts: Any, J: Any, A: Any, g: Any) -> None
             if x == 0.0 and y == 0.0 and z == 0.0 and r == 0.0:  # half of the parameters do not move this sphere
                 continue
             g[i] += x * force[s, 0] + y * force[s, 1] + z * force[s, 2] + r * force[s, 3]
-            for j in range(i, n):
+            for j in range(np.uint64(i), end):
                 A[i, j] += x * pushed[s, 0, j] + y * pushed[s, 1, j] + z * pushed[s, 2, j] + r * pushed[s, 3, j]
     for i in range(n):  # only the upper triangle was added to
         for j in range(i):

@@ -24,24 +24,25 @@ def robust_weight(d: float, width: float) -> tuple[float, float]:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
-def add_block(block: Any, slope: Any, w: Any, away: Any, residual: float, weight: float) -> None:
-    """Add one residual to a part's block (on and above the diagonal of its 4 x 4 pieces) and slope.
+def add_block(blocks: Any, slopes: Any, p: int, w: Any, q: int, away: Any, residual: float, weight: float) -> None:
+    """Add one residual to part p's block (on and above the diagonal of its 4 x 4 pieces) and slope.
 
-    The residual falls by w[k] * away[i] with the place of sphere k along axis i, and by w[k] * away[3] with its radius.
+    The residual falls by w[q, k] * away[i] with the place of sphere k along axis i, and by w[q, k] * away[3] with its
+    radius.
     """
     for k in range(3):
-        if w[k] == 0.0:
+        if w[q, k] == 0.0:
             continue
-        first = weight * w[k]
+        first = weight * w[q, k]
         for i in range(4):
-            slope[4 * k + i] -= first * residual * away[i]
+            slopes[p, 4 * k + i] -= first * residual * away[i]
         for m in range(k, 3):
-            if w[m] == 0.0:
+            if w[q, m] == 0.0:
                 continue
             for i in range(4):
-                both = first * w[m] * away[i]
+                both = first * w[q, m] * away[i]
                 for j in range(4):
-                    block[4 * k + i, 4 * m + j] += both * away[j]
+                    blocks[p, 4 * k + i, 4 * m + j] += both * away[j]
 
 
 @njit(cache=True, inline="always", error_model="numpy")  # type: ignore[misc, unused-ignore]
@@ -171,26 +172,24 @@ def explaining_parts(
             settle_pairs(buffers, pairs, kind, filled, gate, best, hints, w, least, way)
     for kind in range(2):
         settle_pairs(buffers, pairs, kind, filled, gate, best, hints, w, least, way)
-    listed = np.empty(len(rows), np.int64)
+    able = np.zeros(-(-len(rows) // 8) * 8, np.uint8)
+    able_8 = able.view(np.uint64)
     for q in range(count):
         reach = np.float32(best[q] + SLACK)
-        able = 0
-        for p in range(len(rows)):  # all at once: without a branch this takes a few nanoseconds
-            able += least[q, p] - way[p] <= reach
-        if able <= 1:  # which is the hint
-            continue
-        hint = hints[q]
-        n = 0
-        for p in range(len(rows)):
-            listed[n] = p
-            n += (least[q, p] - way[p] <= reach) & (p != hint)
-        for m in range(n):
-            p = listed[m]
-            kind = int(rows[p, 0] == 3.0)
-            put_pair(buffers, pairs, kind, filled[kind], query, facing, rays, q, rows, p)
-            filled[kind] += 1
-            if filled[kind] == LANES:
-                settle_pairs(buffers, pairs, kind, filled, gate, best, hints, w, least, way)
+        for p in range(np.uint64(len(rows))):  # all at once: without a branch this takes a few nanoseconds
+            able[p] = least[q, p] - way[p] <= reach
+        able[hints[q]] = 0
+        for eight in range(len(able_8)):
+            if able_8[eight] == 0:
+                continue
+            for p in range(8 * eight, 8 * eight + 8):
+                if able[p] == 0:
+                    continue
+                kind = int(rows[p, 0] == 3.0)
+                put_pair(buffers, pairs, kind, filled[kind], query, facing, rays, q, rows, p)
+                filled[kind] += 1
+                if filled[kind] == LANES:
+                    settle_pairs(buffers, pairs, kind, filled, gate, best, hints, w, least, way)
     for kind in range(2):
         settle_pairs(buffers, pairs, kind, filled, gate, best, hints, w, least, way)
     return w
@@ -287,10 +286,9 @@ def surface_term(
     cost = 0.0
     for q in range(len(query)):
         p = hints[q]
-        w = weights[q]
-        d = offset_from(query[q], rays[q], parts[p], w, spheres, radii, away)
+        d = offset_from(query[q], rays[q], parts[p], weights[q], spheres, radii, away)
         c, wd = robust_weight(d, width)
         scale = weight_of[q] * (inside_weight if d < 0.0 else 1.0)
         cost += scale * c
-        add_block(blocks[p], slopes[p], w, away, d, scale * wd)
+        add_block(blocks, slopes, p, weights, q, away, d, scale * wd)
     return cost
