@@ -45,7 +45,7 @@ class Weights:
     surface_width_m: float = 0.03
     surface_inside: float = 2.0
     normal_gate_m: float = 0.10
-    inclusion: float = 0.002
+    inclusion: float = 0.0012
     inclusion_width_m: float = 0.06
     inclusion_slack_m: float = 0.002
     penetration: float = 0.01
