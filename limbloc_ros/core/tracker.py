@@ -77,7 +77,7 @@ class Tracker:
     #: When the cost is so much above the usual one, the figure is first carried on by so many steps, and then all limbs
     #: are checked at once; each time in vain, the wait doubles, up to this, unless the cost rises as much once more.
     #: Then a limb that settles where it was counts as well: it may have come back along a better way.
-    LIMB_DOUBT, MORE_STEPS, LONGEST_DOUBT = 1.25, 6, 8
+    LIMB_DOUBT, MORE_STEPS, LONGEST_DOUBT = 1.25, 10, 8
     #: The figure is carried along by so many steps, or by more when it has moved by 10 cm, with the firm weights of
     #: the search, which lead from further off; so many more with the final ones put its joints in their places. (With
     #: limbs checked in every third frame wrists of raised arms stay 10 to 20 cm behind in rough hulls.)
