@@ -188,7 +188,7 @@ def test_best_alone_by_brute_force():
 
 @pytest.mark.parametrize("rays", [False, True], ids=["points", "rays"])
 def test_points_are_explained_by_the_nearest_part(rays):
-    """Against `nearest_part`, point by point."""
+    """Against all parts, asked one by one."""
     rng = np.random.default_rng(14)
     count, surface = 200, np.array([0.06, 0.02, 0.5])
     spheres, radii = rng.uniform(-0.5, 0.5, (12, 3)), rng.uniform(0.02, 0.15, 12)
@@ -198,16 +198,20 @@ def test_points_are_explained_by_the_nearest_part(rays):
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     directions[:: 2 if rays else 1] = 0.0
     within = rng.uniform(0.0, 0.3, count)
-    gaps, costs, w, away, far = np.empty(count), np.empty(count), np.empty(3), np.empty(3), np.empty(9)
+    gaps, costs, away = np.empty(count), np.empty(count), np.empty(3)
     scene, scratch = kernels.scene_of(query, normals, directions), np.empty((11, count))
     kernels.explain(scene, query, directions, parts, spheres, radii, surface, within, scratch, gaps, costs)
-    rows, bounds = _part_kernels.lay_out(parts, spheres, radii)
+    rows, _ = _part_kernels.lay_out(parts, spheres, radii)
     for q in range(count):
         point, ray = query[q], directions[q]
-        gap, p = surface_fit.nearest_part(point, normals[q], ray, rows, bounds, surface[1], within[q], -1, far, w)
-        if p < 0:
+        facing = surface_fit.across(normals[q], ray)
+        found = [surface_fit.gated_distance(row, *point, ray, *facing, surface[1])[1:] for row in rows]
+        p = min(range(len(rows)), key=lambda n: found[n][0])
+        gap, wb, wc = found[p]
+        if gap >= within[q]:
             assert (gaps[q], costs[q]) == (np.inf, 0.0)
             continue
+        w = np.array([1.0 - wb - wc, wb, wc])
         d = surface_fit.offset_from(point, ray, parts[p], w, spheres, radii, away)
         cost = surface_fit.robust_weight(d, surface[0])[0] * (surface[2] if d < 0.0 else 1.0)
         assert (gaps[q], costs[q]) == pytest.approx((gap, cost), abs=1e-12)

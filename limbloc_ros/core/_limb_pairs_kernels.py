@@ -80,7 +80,7 @@ def explain(
 ) -> None:  # fmt: skip
     """How well parts explain points: gated distance and cost, to gaps and costs [Q]; inf and 0 if not `within` [Q].
 
-    The part is that of `nearest_part`. How near each part can be at least is worked out for all points at once, in
+    The part is that of `explaining_parts`. How near each part can be at least is worked out for all points at once, in
     vector code, to `least_of` [2 + P, Q]: most points are far from all parts of a limb, or near to one only.
     """
     rows, bounds = lay_out(parts, spheres, radii)
@@ -178,7 +178,7 @@ def limb_fits(
         spheres, radii: the whole figure; the limb's own places are overwritten.
         all_parts: [P, 3] spheres of every part.
         limb_parts: the same of the limb's parts only.
-        query, normals, rays: the surface to explain, see `nearest_part`.
+        query, normals, rays: the surface to explain, see `explaining_parts`.
         body_gap: [Q] how well the rest of the figure explains it (m, gated).
         surface: [3] width, gate and weight inside of the surface term.
         samples, sample_parts: the inclusion samples of the limb's parts.

@@ -73,40 +73,6 @@ def across(normal: Any, ray: Any) -> tuple[float, float, float]:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
-def nearest_part(
-    point: Any, normal: Any, ray: Any, rows: Any, bounds: Any, gate: float, within: float, hint: int, far: Any, w: Any
-) -> tuple[float, int]:
-    """The part that explains a surface point best, and its distance plus what the gate adds; -1 if none is `within`.
-
-    With a `ray` (unit; zero for none) any point of the ray may be explained. Seen along it spheres are circles, so the
-    distances are those of the spheres' projections. `hint` is asked first: neighbouring points mostly have the same
-    part, and then nearly all others are out of reach. `rows`, `bounds`: of `lay_out`. Writes the nearest sphere's
-    barycentric weights to w [3]; far [P] is scratch.
-    """
-    x, y, z = point[0], point[1], point[2]
-    nx, ny, nz = across(normal, ray)
-    best = within
-    best_part = -1
-    for n in range(-1, len(rows)):
-        p = hint if n < 0 else n
-        if p >= 0 and (n < 0 or (n != hint and far[n] <= 0.0)):
-            _, d, wb, wc = gated_distance(rows[p], x, y, z, ray, nx, ny, nz, gate)
-            if d < best or (d == best and p < best_part):  # of equals the first, whatever the hint
-                best = d
-                best_part = p
-                w[0] = 1.0 - wb - wc
-                w[1] = wb
-                w[2] = wc
-        if n < 0:  # all others at once: without a branch this takes a few nanoseconds
-            for m in range(len(rows)):
-                bx, by, bz = bounds[0, m] - x, bounds[1, m] - y, bounds[2, m] - z
-                along = bx * ray[0] + by * ray[1] + bz * ray[2]
-                reach = max(best + bounds[3, m] + SLACK, 0.0)
-                far[m] = bx * bx + by * by + bz * bz - along * along - reach * reach
-    return best, best_part
-
-
-@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def go_on(parts: Any, spheres: Any, radii: Any, spheres_then: Any, radii_then: Any, way: Any) -> float:
     """Add to `way` [P] by how much the distance to each part can have changed, m, since its spheres were as they were
     then, which from now on is as they are now. Returns the most that one has changed."""
@@ -149,10 +115,17 @@ def bound_distances(query: Any, rays: Any, bounds: Any, hints: Any, least: Any) 
 def explaining_parts(
     query: Any, normals: Any, rays: Any, rows: Any, gate: float, hints: Any, least: Any, way: Any
 ) -> Any:
-    """Write to `hints` [Q] the part that explains each surface point best, as `nearest_part`; returns weights [Q, 3].
+    """Write to `hints` [Q] the part that explains each surface point best: by its distance plus what the gate adds.
+
+    With a ray (unit; zero for none) any point of the ray may be explained. Seen along it spheres are circles, so the
+    distances are those of the spheres' projections. `rows`: of `lay_out`.
 
     `least` [Q, P], less the `way` [P] that a part's spheres have gone meanwhile: no part is nearer than that. So most
-    parts are known to be further off than the one that explained the point before. What is learned here is written.
+    parts are known to be further off than the one that explained the point before, which is asked first. What is
+    learned here is written.
+
+    Returns:
+        [Q, 3] barycentric weights of the part's nearest sphere.
     """
     count = len(query)
     w = np.empty((count, 3))
@@ -269,7 +242,7 @@ def surface_term(
     blocks: Any,
     slopes: Any,
 ) -> float:
-    """Hull surface points to the nearest part: the figure should explain the whole surface (see `nearest_part`).
+    """Hull surface points to the nearest part: the figure should explain the whole surface (`explaining_parts`).
 
     From step to step figures move by millimetres, and a distance changes by no more than the figure moves. So it is
     kept which part was the nearest (`hints` [Q]), how near each part was at least (`least` [Q, P]), and how far it has
