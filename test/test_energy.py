@@ -9,6 +9,7 @@ import pytest
 from energy_cases import BARE, NOTHING, VOXEL, a_person, entangled, only, ray_distances, size, turned_from_rest
 
 from limbloc_ros.core import energy, figure, lm
+from limbloc_ros.core._part_kernels import flesh_distance
 from limbloc_ros.core.energy import Weights
 from limbloc_ros.core.figure import BONE, FigureState, place
 from limbloc_ros.core.hull import Hull
@@ -324,15 +325,15 @@ def test_xor_worked_by_hand():
     sdf[2, 2, 2] = sdf[3, 2, 2] = sdf[0, 0, 0] = -1.0
     one, ball = np.zeros((1, 3), np.int64), np.array([1.1])
     origin = np.array([10.0, -3.0, 0.0])
-    assert energy.kernels.xor_counts(sdf, origin, 1.0, one, origin + np.array([[2.0, 2.0, 2.0]]), ball) == (1, 5, 3)
+    assert energy.xor_counts(sdf, origin, 1.0, one, origin + np.array([[2.0, 2.0, 2.0]]), ball) == (1, 5, 3)
     # beyond the grid: flesh in the world outside counts, too
-    assert energy.kernels.xor_counts(sdf, origin, 1.0, one, origin + np.array([[-7.0, 2.0, 9.0]]), ball) == (3, 7, 3)
+    assert energy.xor_counts(sdf, origin, 1.0, one, origin + np.array([[-7.0, 2.0, 9.0]]), ball) == (3, 7, 3)
     # across its border
-    assert energy.kernels.xor_counts(sdf, origin, 1.0, one, origin + np.array([[0.0, 0.0, 0.0]]), ball) == (2, 6, 3)
+    assert energy.xor_counts(sdf, origin, 1.0, one, origin + np.array([[0.0, 0.0, 0.0]]), ball) == (2, 6, 3)
     # spheres that overlap count once
     two = np.array([[0, 0, 0], [1, 1, 1]])
     spheres = origin + np.array([[2.0, 2.0, 2.0], [3.0, 2.0, 2.0]])
-    assert energy.kernels.xor_counts(sdf, origin, 1.0, two, spheres, np.array([1.1, 1.1])) == (1, 10, 3)
+    assert energy.xor_counts(sdf, origin, 1.0, two, spheres, np.array([1.1, 1.1])) == (1, 10, 3)
 
 
 @pytest.mark.parametrize("offset", [0.0, 0.5, 1.0, 2.5])
@@ -342,7 +343,7 @@ def test_xor_of_two_balls(offset):
     axis = (np.arange(-30, 30) + 0.5) * voxel
     x, y, z = np.meshgrid(axis, axis, axis, indexing="ij")
     sdf = (np.sqrt(x * x + y * y + z * z) - r).astype(np.float32)
-    counts = energy.kernels.xor_counts(
+    counts = energy.xor_counts(
         sdf, np.full(3, axis[0]), voxel, np.zeros((1, 3), np.int64), np.array([[offset, 0.0, 0.0]]), np.array([r])
     )
     lens = np.pi * max(2 - offset, 0) ** 2 * (offset + 4) / 12
@@ -364,6 +365,34 @@ def test_xor_of_people_against_numpy(case):
     expected = (flesh ^ inside).sum() / inside.sum()
     assert 0.1 < expected < 1.5
     assert energy.xor_energy(hull, place(state)) == expected
+
+
+def test_xor_of_any_part_against_each_voxels_distance():
+    # also parts of which one sphere swallows another, that stand upright or lie flat, and at whole voxels
+    rng = np.random.default_rng(5)
+    voxel, axis = 0.05, np.arange(-14, 15) * 0.05
+    points = np.stack(np.meshgrid(axis, axis, np.arange(-40, 40) * voxel, indexing="ij"), axis=-1)
+    grid = (slice(6, -2), slice(1, -6), slice(3, -4))  # flesh lies beyond the hull's grid, too
+    sdf = (np.linalg.norm(points[grid] - [0.1, 0.0, 0.2], axis=-1) - 0.5).astype(np.float32)
+    inside = np.zeros(points.shape[:3], np.bool_)
+    inside[grid] = sdf < 0
+    parts = np.array([[0, 0, 0], [0, 1, 1], [2, 3, 4]])
+    for kind in range(60):
+        centres, radii = rng.uniform(-0.35, 0.35, (5, 3)), rng.uniform(0.04, 0.25, 5)
+        if kind % 4 == 1:
+            centres[1, :2] = centres[0, :2] + rng.choice([0.0, 1e-9, 1e-4])
+            centres[4, :2] = centres[3, :2]
+        elif kind % 4 == 2:
+            centres[:, 2] = centres[0, 2]
+        elif kind % 4 == 3:
+            centres, radii = np.round(centres / voxel) * voxel, np.round(radii / voxel + 0.5) * voxel
+        for some in (parts, *(parts[p : p + 1] for p in range(3))):
+            d, _ = flesh_distance(points.reshape(-1, 3), some, centres, radii)
+            flesh = d.reshape(inside.shape) < 0
+            if (np.abs(d) < 1e-9).any():  # rounding decides
+                continue
+            counts = energy.xor_counts(sdf, points[grid][0, 0, 0], voxel, some, centres, radii)
+            assert counts == ((inside & ~flesh).sum(), (flesh & ~inside).sum(), inside.sum())
 
 
 def test_no_hull_is_as_bad_as_can_be():

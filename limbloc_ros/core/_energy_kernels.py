@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 
 from limbloc_ros.core._figure_kernels import log_so3
-from limbloc_ros.core._part_kernels import SLACK, distance_to_part, lay_out, lay_out_part
+from limbloc_ros.core._part_kernels import distance_to_part, lay_out_part
 from limbloc_ros.core._surface_fit_kernels import add_block, robust_weight
 
 #: How much more a negative amount of clothing costs than a positive one.
@@ -391,79 +391,3 @@ def posture_term(
         A[first + k, first + k] += weight
         g[first + k] += weight * shape[k]
     return cost  # type: ignore[no-any-return]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
-def xor_counts(sdf: Any, origin: Any, voxel: float, parts: Any, spheres: Any, radii: Any) -> tuple[int, int, int]:
-    """Voxels inside the hull only, inside the flesh only (anywhere in the world), and inside the hull (eq. 2).
-
-    A distance changes by no more than the way travelled, a part is convex, and holds all of its spheres: so in a column
-    of voxels few distances tell where it goes in and out.
-    """
-    rows, bounds = lay_out(parts, spheres, radii)
-    low = np.zeros(3, np.int64)
-    high = np.array(sdf.shape)
-    for p in range(len(parts)):
-        for a in range(3):
-            low[a] = min(low[a], math.floor((bounds[a, p] - bounds[3, p] - origin[a]) / voxel))
-            high[a] = max(high[a], math.ceil((bounds[a, p] + bounds[3, p] - origin[a]) / voxel) + 1)
-    filled = np.zeros((high[0] - low[0], high[1] - low[1], high[2] - low[2]), np.bool_)
-    no_ray = np.zeros(3)
-    first = np.empty(3, np.int64)
-    last = np.empty(3, np.int64)
-    flesh = 0
-    both = 0
-    for p in range(len(parts)):
-        row = rows[p]
-        for a in range(3):
-            s0 = 1e9
-            s1 = -1e9
-            for k in range(3):
-                s = parts[p, k]
-                s0 = min(s0, spheres[s, a] - radii[s])
-                s1 = max(s1, spheres[s, a] + radii[s])
-            first[a] = math.ceil((s0 - origin[a]) / voxel)
-            last[a] = math.floor((s1 - origin[a]) / voxel)
-        for i in range(first[0], last[0] + 1):
-            x = origin[0] + i * voxel
-            for j in range(first[1], last[1] + 1):
-                y = origin[1] + j * voxel
-                half2 = bounds[3, p] ** 2 - (x - bounds[0, p]) ** 2 - (y - bounds[1, p]) ** 2
-                if half2 < 0.0:
-                    continue
-                middle = (bounds[2, p] - origin[2]) / voxel
-                half = math.sqrt(half2) / voxel + SLACK
-                k = max(first[2], math.ceil(middle - half))
-                end = min(last[2], math.floor(middle + half))
-                within = 0 <= i < sdf.shape[0] and 0 <= j < sdf.shape[1]
-                column = filled[i - low[0], j - low[1]]
-                entered = False
-                while k <= end:
-                    if column[k - low[2]]:
-                        k += 1
-                        continue
-                    z = origin[2] + k * voxel
-                    d, wb, wc = distance_to_part(row, x, y, z, no_ray)
-                    steps = 1 + int(max(abs(d) - SLACK, 0.0) / voxel)
-                    if d < 0.0:
-                        entered = True
-                        # the part holds the whole sphere of these weights, which the column leaves further up
-                        cx = x - row[1] - wb * row[4] - wc * row[7]
-                        cy = y - row[2] - wb * row[5] - wc * row[8]
-                        cz = row[3] + wb * row[6] + wc * row[9] - z
-                        r = row[10] + wb * row[11] + wc * row[12]
-                        out = cz + math.sqrt(max(r * r - cx * cx - cy * cy, 0.0))
-                        steps = max(steps, 1 + int(max(out - SLACK, 0.0) / voxel))
-                        for m in range(k, min(k + steps, end + 1)):
-                            if not column[m - low[2]]:
-                                column[m - low[2]] = True
-                                flesh += 1
-                                if within and 0 <= m < sdf.shape[2] and sdf[i, j, m] < 0.0:
-                                    both += 1
-                    elif entered:
-                        break
-                    k += steps
-    hull = 0
-    for value in sdf.ravel():
-        hull += value < 0.0
-    return hull - both, flesh - both, hull

@@ -14,6 +14,7 @@ from limbloc_ros.core import _figure_kernels as figure_kernels
 from limbloc_ros.core import figure
 from limbloc_ros.core._figure_topology import PARTS
 from limbloc_ros.core._surface_fit_kernels import surface_term
+from limbloc_ros.core._xor_kernels import xor_counts
 from limbloc_ros.core.figure import FigureState
 from limbloc_ros.core.hull import Hull
 from limbloc_ros.core.lm import System
@@ -310,7 +311,7 @@ def system(state: FigureState, evidence: Evidence, weights: Weights) -> System:
 
 def xor_energy(hull: Hull, placed: figure.Placed) -> float:
     """Eq. 2: voxels in exactly one of hull and flesh, over voxels of the hull."""
-    hull_only, flesh_only, inside = kernels.xor_counts(
+    hull_only, flesh_only, inside = xor_counts(
         hull.sdf, hull.origin_m, hull.voxel_m, figure.PART_SPHERES, placed.spheres, placed.radii
     )
     return float((hull_only + flesh_only) / max(inside, 1))
