@@ -86,6 +86,7 @@ class CarvingNode(Node):
             )
         mask_topics = {name: self.mask_topic(name) for name in s.cameras or (self.rig.names if self.rig else ())}
         self.report = CarvingReport(self, mask_topics)
+        self.report.watch(self.rig)
         self.health = Health(self, self.describe)
         self.kind = Image if s.mask_transport == "raw" else CompressedImage
         for name, topic in mask_topics.items():

@@ -11,12 +11,15 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from limbloc_ros.core._silhouettes_kernels import bounds
 from limbloc_ros.core.camera import Camera, Rig
+from limbloc_ros.rig import _consistency_kernels as kernels
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.uint8]
@@ -45,11 +48,40 @@ class LowView:
 
     def shrink(self, mask: Mask) -> Mask:
         """A mask [height, width] as a small one of 0 and 1; regions to ignore are 0."""
-        size = (self.camera.width, self.camera.height)
-        small = cv2.resize((mask != 0).astype(np.float32), size, interpolation=cv2.INTER_AREA) >= 0.5
+        small = np.zeros((self.camera.height, self.camera.width), np.uint8)
+        ones = np.ascontiguousarray(mask != 0).view(np.uint8)
+        kernels.shrink(ones, bounds(ones), *_shares(ones.shape, small.shape), small)
         if self.ignored is not None:
-            small &= self.ignored == 0
-        return np.asarray(small, dtype=np.uint8)
+            small[self.ignored != 0] = 0
+        return small
+
+
+@cache
+def _shares(
+    large: tuple[int, int], small: tuple[int, int]
+) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.int64], NDArray[np.float32], np.float32]:
+    """What `kernels.shrink` reads of the sizes (height, width) of two images: what OpenCV's INTER_AREA does."""
+    scales = [1.0 / (few / many) for many, few in zip(large, small, strict=True)]
+    places_of, shares_of = [], []
+    for many, few, scale in zip(large, small, scales, strict=True):
+        places, shares = np.zeros((few, 2), np.int64), np.zeros((few, int(np.ceil(scale)) + 2), np.float32)
+        for n in range(few):
+            begin, end = n * scale, n * scale + scale
+            cell = min(scale, many - begin)
+            last = min(int(np.floor(end)), many - 1)
+            first = min(int(np.ceil(begin)), last)
+            parts = [(first - begin) / cell] if first - begin > 1e-3 else []
+            places[n, 0] = first - len(parts)
+            parts += [1.0 / cell] * (last - first)
+            if end - last > 1e-3:
+                parts.append(min(end - last, 1.0, cell) / cell)
+            places[n, 1] = len(parts)
+            shares[n, : len(parts)] = parts
+        places_of.append(places)
+        shares_of.append(shares)
+    even = all(abs(scale - round(scale)) < np.finfo(float).eps for scale in scales)
+    whole = np.float32(1.0 / (round(scales[0]) * round(scales[1])) if even else 0.0)
+    return places_of[1], shares_of[1], places_of[0], shares_of[0], whole
 
 
 @dataclass(frozen=True)
@@ -166,9 +198,12 @@ def shrink_masks(views: Sequence[LowView], masks: Mapping[str, Mask]) -> dict[in
 def inside(grid: Grid, camera: int, mask: Mask, chosen: NDArray[np.int64] | None = None) -> NDArray[np.bool_]:
     """[V] voxels that the camera does not deny: on its foreground, unseen by it, or where it is to be ignored."""
     pixels = grid.pixels[camera] if chosen is None else grid.pixels[camera][chosen]
+    return np.asarray((_opened(grid, camera, mask).ravel()[pixels] != 0) | (pixels < 0))
+
+
+def _opened(grid: Grid, camera: int, mask: Mask) -> Mask:
     ignored = grid.views[camera].ignored
-    open_mask = mask if ignored is None else mask | ignored
-    return np.asarray((open_mask.ravel()[pixels] != 0) | (pixels < 0))
+    return mask if ignored is None else mask | ignored
 
 
 def cover(grid: Grid, camera: int, voxels: NDArray[np.int64]) -> Mask:
@@ -182,8 +217,14 @@ def splat(pixels: NDArray[np.int32], shape: tuple[int, int], reach: int) -> Mask
     """An image with these pixels and what is within `reach` of them set to 1."""
     image = np.zeros(shape, np.uint8)
     image.ravel()[pixels] = 1
-    size = 2 * reach + 1
-    return np.asarray(cv2.dilate(image, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))), dtype=np.uint8)
+    return np.asarray(cv2.dilate(image, _ellipse(reach)), dtype=np.uint8)
+
+
+@cache
+def _ellipse(reach: int) -> Mask:
+    """What is within `reach` of a pixel; uint8 [2 reach + 1, 2 reach + 1]."""
+    size = (2 * reach + 1, 2 * reach + 1)
+    return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, size), dtype=np.uint8)
 
 
 def unexplained_share(mask: Mask, covered: Mask) -> float:
@@ -214,21 +255,35 @@ def score(grid: Grid, masks: Mapping[int, Mask]) -> Scores:
     if len(cameras) < 2:
         nothing = np.full(len(cameras), np.nan)
         return Scores(names, float("nan"), nothing, nothing, nothing)
-    kept = np.stack([inside(grid, c, masks[c]) for c in cameras])
-    seen = np.stack([grid.pixels[c] >= 0 for c in cameras])
     # As in carving: what most cameras do not see is nobody's hull.
-    enough = seen.sum(axis=0) > max(1, len(cameras) // 2)
-    denials = (~kept).sum(axis=0)
-    full = np.flatnonzero((denials == 0) & enough)
-    unexplained = np.array([unexplained_share(masks[c], cover(grid, c, full)) for c in cameras])
-    without, alone = np.full(len(cameras), np.nan), np.full(len(cameras), np.nan)
-    for i, c in enumerate(cameras):
-        rest = np.flatnonzero((denials - ~kept[i] == 0) & enough)
-        alone[i] = unexplained_share(masks[c], cover(grid, c, rest))
-        others = [unexplained_share(masks[k], cover(grid, k, rest)) for k in cameras if k != c]
+    numbers = np.array(cameras)
+    opened = [_opened(grid, c, masks[c]) for c in cameras]
+    sizes = [image.size for image in opened]
+    offsets = np.cumsum([0, *sizes[:-1]])
+    voxels, who = kernels.sole_deniers(grid.pixels, numbers, np.concatenate(opened, axis=None), offsets)
+    order = np.argsort(who, kind="stable")
+    begins = np.searchsorted(who[order], np.arange(len(cameras) + 2))
+    cores = [core_of(masks[c]) for c in cameras]
+    frames = np.array([(first, *core.shape[::-1]) for first, core in zip(offsets, cores, strict=True)])
+    marks = np.concatenate([core != 0 for core in cores], axis=None).view(np.uint8)
+    counts = kernels.explained(grid.pixels, numbers, voxels[order], begins, marks, frames, _halves(grid.reach[numbers]))
+    totals = np.array([cv2.countNonZero(core) for core in cores])
+    shares = np.where(totals > 0, 1.0 - counts / np.maximum(totals, 1), 0.0)
+    unexplained, without = shares[-1], np.full(len(cameras), np.nan)
+    for i in range(len(cameras)):
+        others = np.delete(shares[i], i)
         if len(others) > 1:  # two cameras alone nearly always agree
             without[i] = float(np.mean(others))
-    return Scores(names, float(unexplained.mean()), without, unexplained, alone)
+    return Scores(names, float(unexplained.mean()), without, unexplained, shares.diagonal().copy())
+
+
+def _halves(reach: NDArray[np.int64]) -> NDArray[np.int64]:
+    """What `kernels.explained` reads of the ellipses that `splat` draws."""
+    most = int(reach.max())
+    halves = np.full((len(reach), 2 * most + 1), -1)
+    for row, own in zip(halves, reach.tolist(), strict=True):
+        row[most - own : most + own + 1] = (_ellipse(own).sum(axis=1, dtype=np.int64) - 1) // 2
+    return halves
 
 
 def mean_scores(scores: Collection[Scores], names: Sequence[str]) -> Scores:

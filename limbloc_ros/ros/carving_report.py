@@ -107,6 +107,12 @@ class CarvingReport:
             *(self._camera(c, counters, problems, bool(backlog.behind)) for c in self._topics),
         ]
 
+    def watch(self, rig: Rig | None) -> ConsistencyWatch | None:
+        """What will look whether these cameras agree. To make it takes a moment: better before masks come."""
+        if rig is not None and (self._watch is None or self._watch.rig is not rig):
+            self._watch = ConsistencyWatch(rig)
+        return None if rig is None else self._watch
+
     def _look_back(self, counters: SyncCounters) -> None:
         """Keep what was counted some seconds ago."""
         now = time.monotonic()
@@ -120,13 +126,12 @@ class CarvingReport:
 
     def _compare(self, rig: Rig | None) -> None:
         """Find out whether a camera has been bumped; a hull that vanished because of one is looked at too."""
-        if rig is None or self._last is None or self._last is self._compared:
+        watch = self.watch(rig)
+        if watch is None or self._last is None or self._last is self._compared:
             return
-        if self._watch is None or self._watch.rig is not rig:
-            self._watch = ConsistencyWatch(rig)
         self._compared = self._last
-        self._watch.look(self._last.items)
-        self._suspect = self._watch.suspect()
+        watch.look(self._last.items)
+        self._suspect = watch.suspect()
 
     def _hull(
         self,
