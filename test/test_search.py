@@ -4,6 +4,7 @@
 Such hulls say nothing of real people (see test_engine_robust.py); they say whether a search finds what is there.
 """
 
+import itertools
 import math
 
 import figure_poses
@@ -157,6 +158,55 @@ def test_hypotheses_differ_and_are_the_same_every_time(person):
             side = math.acos(min(1.0, abs(R[:, 1] @ Q[:, 1])))
             axis = math.acos(min(1.0, R[:, 2] @ Q[:, 2]))
             assert np.linalg.norm(a.root - b.root) >= 0.08 or max(side, axis) >= 0.4
+
+
+def torsos_one_by_one(person, pelvis, skull, headings):
+    """All torsos [N, 14] between seeds, each placed and scored by itself."""
+    hull, table = person.hull, search._torso_table()
+    grid = (hull.sdf, hull.origin_m, hull.voxel_m)
+    exp = figure.kernels.exp_so3
+    rows = []
+    for a, b in itertools.product(pelvis[:, :3], skull[:, :3]):
+        chord = [kernels.depth_at(*grid, *(a + t * (b - a))) for t in (0.3, 0.5, 0.7)]
+        length = np.linalg.norm(b - a)
+        if not 0.3 <= length <= 0.95 or max(chord) > 0.03:
+            continue
+        v = (b - a) / length
+        for bend, base, tip in zip(table.bends, table.axis_base, table.axis_tip, strict=True):
+            u = (tip - base) / np.linalg.norm(tip - base)
+            stature = length / np.linalg.norm(tip - base)
+            axis = np.cross(u, v)
+            align = exp(axis / np.linalg.norm(axis) * np.arctan2(np.linalg.norm(axis), u @ v))
+            for y in range(headings if 1.0 <= stature <= 2.15 else 0):
+                R = exp(v * math.pi * y / headings) @ align
+                pose = np.concatenate(
+                    [a - stature * R @ base, figure.kernels.log_so3(R), bend, np.zeros(3), [np.log(stature)]]
+                )
+                spheres = search.torso_kernels.place_torso(pose, *table.arrays)
+                score = search.torso_kernels.torso_score(*grid, *spheres, table.weights, table.n_solid, 0.04 * stature)
+                rows.append([*pose, score])
+    return np.array(rows)
+
+
+def test_torsos_between_seeds_against_one_by_one(person):
+    hull, table, points = person.hull, search._torso_table(), person.medial.points
+    depth = np.argsort(-points[:, 3], kind="stable")
+    pelvis = points[kernels.spread_out(points, depth, 0.15, 7)]
+    skull = points[kernels.spread_out(points, depth, 0.11, 11)]
+    expected = torsos_one_by_one(person, pelvis, skull, 5)
+    expected = expected[np.argsort(expected[:, 13])]
+    assert len(expected) > 4 * kernels.CHUNK
+    for most in (20, 150, len(expected) + 5):  # some queues end full, some begun
+        found = search.torso_kernels.torso_from_pairs(
+            pelvis, skull, table.axis_base, table.axis_tip, table.bends, 5, 0.3, 0.95,
+            hull.sdf, hull.origin_m, hull.voxel_m, table.arrays, table.weights, table.n_solid, most,
+        )  # fmt: skip
+        found = found[np.argsort(found[:, 13])]
+        np.testing.assert_allclose(found[:, 13], expected[:most, 13], atol=1e-6)
+        assert len(found) == min(most, len(expected))
+        for row in found:  # wherever equals stand
+            same = expected[np.abs(expected[:, 13] - row[13]) < 1e-6]
+            assert np.abs(same - row).max(axis=1).min() < 1e-6
 
 
 def test_different_torsos_against_numpy():

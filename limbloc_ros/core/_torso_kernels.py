@@ -10,7 +10,16 @@ import numpy as np
 from numba import njit
 
 from limbloc_ros.core._figure_kernels import exp_so3, forward, log_so3
-from limbloc_ros.core._search_kernels import depth_at, pop, push
+from limbloc_ros.core._search_kernels import CHUNK, chunk_scratch, depth_at, depths_at, pop, push
+
+#: A sphere's miss counts up to this fraction of the stature.
+CLIP = 0.04
+#: Torsos are asked for so many spheres before those that are out already are sorted out.
+STAGES = (0, 8, 12)
+#: Torsos that wait are columns of a queue; where its rows begin: root, rotation, stature, and what was missed so far.
+WIDE = 2 * CHUNK
+ROOT, TURN, STATURE, TOTAL = 0, 3 * WIDE, 12 * WIDE, 13 * WIDE
+_ONE, _TWO = np.uint32(1), np.uint32(2)
 
 
 @njit(cache=True, inline="always", error_model="numpy")  # type: ignore[misc, unused-ignore]
@@ -70,6 +79,106 @@ def place_torso(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def ask_spheres(
+    queue: Any, bends: Any, units: Any, unit_radii: Any, weights: Any, n_solid: int, first: int, last: int,
+    sdf: Any, origin: Any, voxel: float, scratch: tuple[Any, Any, Any],
+) -> None:  # fmt: skip
+    """Add what the spheres from `first` to `last` miss (`misfit`) to the totals of the first CHUNK torsos of a queue.
+
+    `bends` [WIDE]: where in `units` a torso's unit figure begins, whose spheres lie there one after the other.
+    """
+    work, cells, corners = scratch
+    for s in range(first, last):
+        here = np.uint32(3 * s)
+        for n in range(CHUNK):
+            at = bends[n] + here
+            work[4 * CHUNK + n] = units[at]
+            work[5 * CHUNK + n] = units[at + _ONE]
+            work[6 * CHUNK + n] = units[at + _TWO]
+        for n in range(CHUNK):
+            px, py, pz = work[4 * CHUNK + n], work[5 * CHUNK + n], work[6 * CHUNK + n]
+            stature = queue[STATURE + n]
+            for i in range(3):
+                k = TURN + 3 * i * WIDE + n
+                work[i * CHUNK + n] = queue[ROOT + i * WIDE + n] + stature * (
+                    queue[k] * px + queue[k + WIDE] * py + queue[k + 2 * WIDE] * pz
+                )
+        depths_at(sdf, origin, voxel, work, cells, corners)
+        radius, weight = unit_radii[s], weights[s]
+        if s < n_solid:
+            for n in range(CHUNK):
+                stature = queue[STATURE + n]
+                miss = misfit(work[3 * CHUNK + n], stature * radius, True, CLIP * stature)
+                queue[TOTAL + n] += weight * miss
+        else:
+            for n in range(CHUNK):
+                stature = queue[STATURE + n]
+                miss = misfit(work[3 * CHUNK + n], stature * radius, False, CLIP * stature)
+                queue[TOTAL + n] += weight * miss
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def work_off(
+    queues: Any, bent: Any, waiting: Any, least: int, units: Any, unit_radii: Any, bends: Any, weights: Any,
+    n_solid: int, norm: float, sdf: Any, origin: Any, voxel: float, scratch: tuple[Any, Any, Any],
+    out: Any, goodness: Any, heap: Any, count: int,
+) -> int:  # fmt: skip
+    """Ask the first CHUNK torsos of each queue with at least `least`: those that may do go on, in the end to a heap.
+
+    No torso overtakes another, so that a heap meets them in the order they came in. On the way they are compared with
+    the worst of a heap that lacks those before them, which leaves out none that belongs there. Returns how many the
+    heap has now. A queue keeps less than CHUNK, and gets no more than these from the one before: WIDE hold both.
+    """
+    most = len(out)
+    R = np.empty((3, 3))
+    for stage in range(len(STAGES)):
+        ends = stage + 1 == len(STAGES)
+        last = len(weights) if ends else STAGES[stage + 1]
+        queue, bend = queues[stage], bent[stage]
+        if waiting[stage] < least:
+            continue
+        size = min(waiting[stage], CHUNK)
+        ask_spheres(queue, bend, units, unit_radii, weights, n_solid, STAGES[stage], last, sdf, origin, voxel, scratch)
+        for n in range(size):
+            stature, total = queue[STATURE + n], queue[TOTAL + n]
+            clip = CLIP * stature
+            full = count == most
+            enough = -goodness[heap[0]] * norm * clip * clip if full else math.inf
+            if total >= enough:
+                continue
+            if not ends:
+                at = waiting[stage + 1]
+                for i in range(14):
+                    queues[stage + 1, i * WIDE + at] = queue[i * WIDE + n]
+                bent[stage + 1, at] = bend[n]
+                waiting[stage + 1] += 1
+                continue
+            for i in range(3):
+                for j in range(3):
+                    R[i, j] = queue[TURN + (3 * i + j) * WIDE + n]
+            row = pop(heap, most, goodness) if full else count
+            turn = log_so3(R)
+            bending = bend[n] // (3 * len(weights))
+            for i in range(3):
+                out[row, i] = queue[ROOT + i * WIDE + n]
+                out[row, 3 + i] = turn[i]
+                out[row, 6 + i] = bends[bending, i]
+                out[row, 9 + i] = 0.0
+            out[row, 12] = math.log(stature)
+            out[row, 13] = total / (norm * clip * clip)
+            goodness[row] = -out[row, 13]
+            push(heap, most - 1 if full else count, goodness, row)
+            count += not full
+        rest = waiting[stage] - size
+        for n in range(rest):
+            for i in range(14):
+                queue[i * WIDE + n] = queue[i * WIDE + size + n]
+            bend[n] = bend[size + n]
+        waiting[stage] = rest
+    return count
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def torso_from_pairs(
     pelvis_seeds: Any,
     head_seeds: Any,
@@ -99,7 +208,6 @@ def torso_from_pairs(
     heap = np.empty(most, np.int64)
     count = 0
     pose = np.zeros(13)
-    R = np.empty((3, 3))
     turn = np.empty(3)
     about = np.empty((yaws, 3, 3))
     # the unit figure of each bend; every torso is one of these, turned and scaled
@@ -111,6 +219,13 @@ def torso_from_pairs(
             pose, parents, bone_offsets, point_bones, point_offsets, point_radii
         )
     norm = weights.sum()
+    n_spheres = len(weights)
+    units = unit_points.reshape(-1)
+    queues = np.zeros((len(STAGES), 14 * WIDE))
+    bent = np.zeros((len(STAGES), WIDE), np.uint32)
+    waiting = np.zeros(len(STAGES), np.int64)
+    R = np.empty((3, 3))
+    scratch = chunk_scratch()
     for a in range(len(pelvis_seeds)):
         for b in range(len(head_seeds)):
             dx = head_seeds[b, 0] - pelvis_seeds[a, 0]
@@ -157,6 +272,10 @@ def torso_from_pairs(
                     turn[0] = math.pi
                 align = exp_so3(turn)
                 for y in range(yaws):
+                    n = waiting[0]
+                    queues[0, STATURE + n] = stature
+                    queues[0, TOTAL + n] = 0.0
+                    bent[0, n] = 3 * c * n_spheres
                     for i in range(3):
                         for j in range(3):
                             R[i, j] = (
@@ -164,39 +283,22 @@ def torso_from_pairs(
                                 + about[y, i, 1] * align[1, j]
                                 + about[y, i, 2] * align[2, j]
                             )
+                            queues[0, TURN + (3 * i + j) * WIDE + n] = R[i, j]
                     for i in range(3):
-                        pose[i] = pelvis_seeds[a, i] - stature * (
+                        queues[0, ROOT + i * WIDE + n] = pelvis_seeds[a, i] - stature * (
                             R[i, 0] * axis_base[c, 0] + R[i, 1] * axis_base[c, 1] + R[i, 2] * axis_base[c, 2]
                         )
-                    clip = 0.04 * stature
-                    full = count == most
-                    enough = -goodness[heap[0]] * norm * clip * clip if full else math.inf
-                    total = 0.0
-                    for n in range(len(weights)):
-                        px, py, pz = unit_points[c, n, 0], unit_points[c, n, 1], unit_points[c, n, 2]
-                        e = depth_at(
-                            sdf,
-                            origin,
-                            voxel,
-                            pose[0] + stature * (R[0, 0] * px + R[0, 1] * py + R[0, 2] * pz),
-                            pose[1] + stature * (R[1, 0] * px + R[1, 1] * py + R[1, 2] * pz),
-                            pose[2] + stature * (R[2, 0] * px + R[2, 1] * py + R[2, 2] * pz),
-                        )
-                        total += weights[n] * misfit(e, stature * unit_radii[n], n < n_solid, clip)
-                        if total >= enough:
-                            break
-                    if total >= enough:
-                        continue
-                    row = pop(heap, most, goodness) if full else count
-                    out[row, :3] = pose[:3]
-                    out[row, 3:6] = log_so3(R)
-                    out[row, 6:9] = bends[c]
-                    out[row, 9:12] = 0.0
-                    out[row, 12] = math.log(stature)
-                    out[row, 13] = total / (norm * clip * clip)
-                    goodness[row] = -out[row, 13]
-                    push(heap, most - 1 if full else count, goodness, row)
-                    count += not full
+                    waiting[0] += 1
+                    if waiting[0] == CHUNK:
+                        count = work_off(
+                            queues, bent, waiting, CHUNK, units, unit_radii, bends, weights, n_solid, norm,
+                            sdf, origin, voxel, scratch, out, goodness, heap, count,
+                        )  # fmt: skip
+    while waiting.max() > 0:
+        count = work_off(
+            queues, bent, waiting, 1, units, unit_radii, bends, weights, n_solid, norm,
+            sdf, origin, voxel, scratch, out, goodness, heap, count,
+        )  # fmt: skip
     return out[:count]
 
 
