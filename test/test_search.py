@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from flesh_hulls import POSTURES, VOXEL, hull_where, person_in
 
+from limbloc_ros.core import _part_kernels as part_kernels
 from limbloc_ros.core import figure, search
 from limbloc_ros.core.directions import sphere_directions
 from limbloc_ros.core.figure import BONE, place
@@ -336,6 +337,26 @@ def test_explained_volume_worked_by_hand():
     limb_kernels.add_explained(grid, hull.origin_m, 2 * VOXEL, np.zeros(3), 0.0, 2.0, ways, 2, cells)
     assert ways[6, 0] == pytest.approx(0.5 + 2.0)
     assert ways[6, 1] == pytest.approx(0.5)  # from 11 cm on: where nothing is explained, and beyond the grid
+
+
+@pytest.mark.parametrize("stride", [1, 2, 3])
+def test_explained_volume_against_the_distance_to_all_parts(person, stride):
+    hull, (spheres, radii) = person.hull, (person.placed.spheres, person.placed.radii)
+    parts = figure.PART_SPHERES[::2]
+    assert {len(set(part)) for part in parts.tolist()} >= {2, 3}
+    args = (hull.origin_m, hull.voxel_m, stride, parts, spheres, radii)
+    grid = limb_kernels.explained_grid(hull.sdf, *args)
+    assert grid.dtype == np.float32
+    sparse = hull.sdf[::stride, ::stride, ::stride]
+    cells = hull.origin_m + stride * VOXEL * np.indices(sparse.shape).reshape(3, -1).T
+    depth = -part_kernels.flesh_distance(cells, parts, spheres, radii)[0].reshape(sparse.shape)
+    expected = np.where(sparse <= 0.02, np.clip(depth / 0.05, 0.0, 1.0), 0.0)
+    assert (expected == 1.0).any()
+    np.testing.assert_allclose(grid, expected, atol=1e-6)
+    beyond = limb_kernels.explained_grid(hull.sdf, hull.origin_m + 9.0, *args[1:])
+    assert not beyond.any()
+    assert not limb_kernels.explained_grid(hull.sdf, hull.origin_m - 9.0, *args[1:]).any()
+    assert not limb_kernels.explained_grid(np.full_like(hull.sdf, 0.5), *args).any()
 
 
 def test_ways_from_a_point_against_numpy():

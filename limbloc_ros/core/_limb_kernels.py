@@ -9,7 +9,18 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from limbloc_ros.core._part_kernels import distance_to_part, lay_out
+from limbloc_ros.core._many_parts_kernels import (
+    BUFFER,
+    LANES,
+    PLAIN,
+    Q,
+    R,
+    U,
+    V,
+    measure_pairs_of_three,
+    measure_pairs_of_two,
+)
+from limbloc_ros.core._part_kernels import lay_out
 from limbloc_ros.core._search_kernels import CHUNK, chunk_scratch, depths_at, pop, push, spread_out
 
 #: Ragged masks eat into limbs: a bone may be thinner than expected by this fraction of its radius at no cost.
@@ -27,35 +38,76 @@ MIDDLES, MIDDLES_APART, LIMBS_APART = 24, 0.12, 0.22
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
-def explained_grid(sdf: Any, origin: Any, voxel: float, stride: int, parts: Any, spheres: Any, radii: Any) -> Any:
-    """How far each cell of `stride` voxels lies inside the given parts: 0 outside, 1 from 5 cm depth on; float32."""
+def cells_within(sdf: Any, origin: Any, voxel: float, stride: int, most: float) -> tuple[Any, Any, Any]:
+    """Cells of `stride` voxels up to `most` (m) outside: places [3, N + LANES], indices [3, N], where slices begin.
+
+    They are in array order; slice i of the first axis has those from `starts`[i] to `starts`[i + 1].
+    """
     nx = (sdf.shape[0] + stride - 1) // stride
     ny = (sdf.shape[1] + stride - 1) // stride
     nz = (sdf.shape[2] + stride - 1) // stride
-    out = np.zeros((nx, ny, nz), np.float32)
-    rows, bounds = lay_out(parts, spheres, radii)
-    no_ray = np.zeros(3)
+    indices = np.empty((3, nx * ny * nz + 1), np.int32)
+    starts = np.zeros(nx + 1, np.int64)
+    count = 0
     for i in range(nx):
-        x = origin[0] + i * stride * voxel
         for j in range(ny):
-            y = origin[1] + j * stride * voxel
             for k in range(nz):
-                if sdf[i * stride, j * stride, k * stride] > 0.02:
-                    continue
-                z = origin[2] + k * stride * voxel
-                worst = 0.0
-                for p in range(len(parts)):
-                    bx = x - bounds[0, p]
-                    by = y - bounds[1, p]
-                    bz = z - bounds[2, p]
-                    reach = bounds[3, p] + worst
-                    if reach <= 0.0 or bx * bx + by * by + bz * bz > reach * reach:
-                        continue
-                    d, _, _ = distance_to_part(rows[p], x, y, z, no_ray)
-                    worst = min(worst, d)
-                    if worst < -0.05:
-                        break
-                out[i, j, k] = min(-worst / 0.05, 1.0)
+                indices[0, count], indices[1, count], indices[2, count] = i, j, k
+                count += sdf[i * stride, j * stride, k * stride] <= most
+        starts[i + 1] = count
+    places = np.zeros((3, count + LANES))
+    for n in range(count):
+        places[0, n] = origin[0] + indices[0, n] * stride * voxel
+        places[1, n] = origin[1] + indices[1, n] * stride * voxel
+        places[2, n] = origin[2] + indices[2, n] * stride * voxel
+    return places, indices[:, :count], starts
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def explained_grid(sdf: Any, origin: Any, voxel: float, stride: int, parts: Any, spheres: Any, radii: Any) -> Any:
+    """How far each cell of `stride` voxels lies inside the given parts: 0 outside, 1 from 5 cm depth on; float32."""
+    places, indices, starts = cells_within(sdf, origin, voxel, stride, 0.02)
+    nx = len(starts) - 1
+    worst = np.zeros(places.shape[1])
+    near = np.zeros(len(worst) + LANES)
+    asked = np.zeros(len(worst) + LANES, np.int64)
+    buffer = np.zeros(BUFFER)  # no rays, no normals
+    rows, bounds = lay_out(parts, spheres, radii)
+    for p in range(len(parts)):
+        px, py, pz, reach = bounds[0, p], bounds[1, p], bounds[2, p], bounds[3, p]
+        low = math.floor((px - reach - origin[0]) / (stride * voxel))
+        high = math.floor((px + reach - origin[0]) / (stride * voxel)) + 2
+        first = np.uint64(starts[min(max(low, 0), nx)])
+        last = np.uint64(starts[min(max(high, 0), nx)])
+        for n in range(first, last):
+            bx, by, bz = places[0, n] - px, places[1, n] - py, places[2, n] - pz
+            left = reach + worst[n]  # a part around which less is left lies nowhere so deep
+            inside = (left > 0.0) & (bx * bx + by * by + bz * bz <= left * left) & (worst[n] >= -0.05)
+            near[n] = 1.0 if inside else 0.0
+        count = 0
+        for n in range(first, last):
+            asked[count] = n
+            count += int(near[n])
+        for lane in range(LANES):
+            for i in range(3):
+                buffer[U + i * LANES + lane] = rows[p, 4 + i]
+                buffer[V + i * LANES + lane] = rows[p, 7 + i]
+                buffer[R + i * LANES + lane] = rows[p, 10 + i]
+        for begin in range(0, count, LANES):
+            for lane in range(LANES):
+                n = asked[begin + lane]
+                for i in range(3):
+                    buffer[Q + i * LANES + lane] = places[i, n] - rows[p, 1 + i]
+            if rows[p, 0] == 3.0:
+                measure_pairs_of_three(buffer, 0.0)
+            else:
+                measure_pairs_of_two(buffer, 0.0)
+            for lane in range(min(LANES, count - begin)):
+                n = asked[begin + lane]
+                worst[n] = min(worst[n], buffer[PLAIN + lane])
+    out = np.zeros((nx, (sdf.shape[1] + stride - 1) // stride, (sdf.shape[2] + stride - 1) // stride), np.float32)
+    for n in range(indices.shape[1]):
+        out[indices[0, n], indices[1, n], indices[2, n]] = min(-worst[n] / 0.05, 1.0)
     return out
 
 
