@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from limbloc_ros.core._figure_kernels import exp_so3
+from limbloc_ros.core._part_kernels import distance_to_part, lay_out
 from limbloc_ros.core._unexplained_kernels import farthest
 from limbloc_ros.core.figure import BONE, FigureState, place
 from limbloc_ros.core.parts import Part
@@ -37,6 +38,32 @@ def test_rays_nearest_to_some_parts_are_not_asked():
     assert farthest(points, rays, parts, *balls, np.array([True, True])) == pytest.approx(np.hypot(0.1, 0.4) - 0.1)
     assert farthest(points, rays, parts, *balls, np.array([True, False])) == pytest.approx(0.2)
     assert farthest(points, rays, parts, *balls, np.array([False, False])) == 0.0
+
+
+def test_farthest_against_every_part():
+    rng = np.random.default_rng(11)
+    no_ties = np.arange(36).reshape(12, 3)
+    parts = np.array([[a, b, c] if p % 2 else [a, b, b] for p, (a, b, c) in enumerate(no_ties)])
+    for count in (1, 3, 64, 300):
+        centres, radii = rng.uniform(-0.5, 0.5, (36, 3)), rng.uniform(0.02, 0.06, 36)
+        points, rays = rng.uniform(-0.8, 0.8, (count, 3)), rng.normal(size=(count, 3))
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        rows, _ = lay_out(parts, centres, radii)
+        far = np.array(
+            [[distance_to_part(row, *p, ray)[0] for row in rows] for p, ray in zip(points, rays, strict=True)]
+        )
+        for counts in (np.ones(12, np.bool_), rng.random(12) < 0.5):
+            asked = far.min(axis=1)[counts[far.argmin(axis=1)]]
+            assert farthest(points, rays, parts, centres, radii, counts) == asked.max(initial=0.0)
+
+
+def test_of_parts_as_near_the_one_of_the_point_before_counts():
+    parts = np.array([[0, 0, 0], [1, 1, 1], [2, 2, 2]])  # the first two are one place
+    centres, radii = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [5.0, 0.0, 0.0]]), np.array([0.1, 0.1, 0.1])
+    points, rays = np.array([[0.0, 0.0, 0.3]]), np.array([[0.0, 1.0, 0.0]])
+    for counts in ([True, False, True], [False, True, True]):
+        asked = farthest(points, rays, parts, centres, radii, np.array(counts))
+        assert asked == pytest.approx(0.2 if counts[0] else 0.0)
 
 
 def test_an_arm_elsewhere_is_not_explained():
