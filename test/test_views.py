@@ -170,7 +170,7 @@ def test_discs_between_two_rows_cover_nothing():
     discs = np.array([[3.0, 4.0 - 2e-8, 1e-8], [3.0, 4.0 + 2e-8, 1e-8], [3.3, 4.3, 0.1]])
     span, drawn = np.empty((2, 8)), np.zeros(64, np.int16)
     parts = np.array([[0, 1, 1], [2, 2, 2]])
-    assert kernels.draw_parts(parts, discs, frames[0], span, cells, drawn, 1, False) == (0, 0)
+    assert kernels.draw_parts(parts, discs, frames[0], span, cells, drawn, 1) == (0, 0)
     assert not drawn.any()
 
 

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from limbloc_ros.core._bit_kernels import WORD, between, count
+from limbloc_ros.core._bit_kernels import WORD, between, word_at_least, words
+from limbloc_ros.core._bit_kernels import count as count_bits
 from limbloc_ros.core._projection_kernels import project, project_block, row_start
 from limbloc_ros.core._union_kernels import join, root
 
@@ -196,12 +197,10 @@ def _outline(parts: Any, p: int, discs: Any, height: int, left: Any, right: Any)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
-def draw_parts(
-    parts: Any, discs: Any, frame: Any, span: Any, cells: Any, drawn: Any, mark: int, alone: bool
-) -> tuple[int, int]:
+def draw_parts(parts: Any, discs: Any, frame: Any, span: Any, cells: Any, drawn: Any, mark: int) -> tuple[int, int]:
     """Write `mark` to the cells of one camera whose centres the parts cover, but where `drawn` is BODY.
 
-    Another mark that is there already is replaced, or with `alone` both give way to BODY. `span` is scratch, [2, rows].
+    Another mark that is there already is replaced. `span` is scratch, [2, rows].
 
     Returns how many of the cells that get this mark are foreground, and background.
     """
@@ -217,9 +216,6 @@ def draw_parts(
             end = math.floor(min(right[row], width - 1.0))
             for at in range(offset + row * width + begin, offset + row * width + end + 1):
                 if drawn[at] != mark and drawn[at] != BODY:
-                    if alone and drawn[at] != 0:
-                        drawn[at] = BODY
-                        continue
                     drawn[at] = mark
                     if cells[at] == BARE:
                         bare += 1
@@ -239,8 +235,27 @@ def draw(parts: Any, centres: Any, radii: Any, cams: Any, frames: Any, cells: An
     counts = np.empty((len(frames), 2), np.int64)
     for c in range(len(frames)):
         see_balls(centres, radii, cams, c, frames[c], discs)
-        counts[c, 0], counts[c, 1] = draw_parts(parts, discs, frames[c], span, cells, drawn, BODY, False)
+        counts[c, 0], counts[c, 1] = draw_parts(parts, discs, frames[c], span, cells, drawn, BODY)
     return counts
+
+
+@njit(cache=True, inline="always", error_model="numpy")  # type: ignore[misc, unused-ignore]
+def _fill(drawn: Any, first: int, last: int, width: int, offset: int, left: Any, right: Any) -> None:
+    """Set the bits of the cells that a part covers, of which `_outline` tells; `left` and `right` are scratch then."""
+    for row in range(np.uint64(first), np.uint64(last + 1)):  # first column, and how many: none if they cross
+        begin = math.ceil(min(max(left[row], 0.0), float(width)))
+        end = math.floor(min(max(right[row], -1.0), width - 1.0)) + 1
+        left[row], right[row] = begin, max(end - begin, 0)
+    for row in range(first, last + 1):
+        begin, columns = offset + row * width + int(left[row]), int(right[row])
+        k, shift = begin // WORD, np.uint64(begin % WORD)
+        if columns < WORD:  # mostly, and without a branch for the word in which they end
+            some = (_ONE << np.uint64(columns)) - _ONE
+            drawn[k] |= some << shift
+            drawn[k + 1] |= (some >> _ONE) >> (_LAST - shift)
+        else:
+            for k in range(begin // WORD, (begin + columns + WORD - 1) // WORD):
+                drawn[k] |= between(begin, begin + columns, k)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
@@ -272,25 +287,12 @@ def covered(parts: Any, centres: Any, radii: Any, cams: Any, frames: Any, seen: 
         see_balls(balls[:used, :3], balls[:used, 3], cams, c, frames[c], discs)
         for p in range(len(parts)):
             first, last = _outline(own, p, discs, height, left, right)
-            for row in range(np.uint64(first), np.uint64(last + 1)):  # first column, and how many: none if they cross
-                begin = math.ceil(min(max(left[row], 0.0), float(width)))
-                end = math.floor(min(max(right[row], -1.0), width - 1.0)) + 1
-                left[row], right[row] = begin, max(end - begin, 0)
-            for row in range(first, last + 1):
-                begin, columns = offset + row * width + int(left[row]), int(right[row])
-                k, shift = begin // WORD, np.uint64(begin % WORD)
-                if columns < WORD:  # mostly, and without a branch for the word in which they end
-                    some = (_ONE << np.uint64(columns)) - _ONE
-                    drawn[k] |= some << shift
-                    drawn[k + 1] |= (some >> _ONE) >> (_LAST - shift)
-                else:
-                    for k in range(begin // WORD, (begin + columns + WORD - 1) // WORD):
-                        drawn[k] |= between(begin, begin + columns, k)
+            _fill(drawn, first, last, width, offset, left, right)
         end = offset + width * height
         for k in range(offset // WORD, (end + WORD - 1) // WORD):
             word = drawn[k] & between(offset, end, k)
-            counts[c, 0] += count(word & seen[k])
-            counts[c, 1] += count(word & bare[k])
+            counts[c, 0] += count_bits(word & seen[k])
+            counts[c, 1] += count_bits(word & bare[k])
     return counts
 
 
@@ -304,19 +306,32 @@ def draw_groups(
     `groups` [P] says to which each part belongs, 0 to count - 1.
     """
     discs = np.empty((len(centres), 3))
-    span = np.empty((2, max(1, frames[:, 3].max())))
-    drawn = np.zeros(len(cells), np.int16)
+    left, right = np.empty((2, max(1, frames[:, 3].max())))
+    drawn = np.zeros((count, words(len(cells)) + 1), np.uint64)  # as in `covered`
+    marks = cells.reshape(1, len(cells))
     counts = np.zeros((len(frames), count + 2), np.int64)
     for c in range(len(frames)):
+        _, _, width, height, _, offset = frames[c]
         see_balls(centres, radii, cams, c, frames[c], discs)
         for p in range(len(parts)):
-            seen, bare = draw_parts(parts[p : p + 1], discs, frames[c], span, cells, drawn, groups[p] + 1, True)
-            counts[c, count] += seen
-            counts[c, count + 1] += bare
-        begin = frames[c, 5]
-        for at in range(begin, begin + frames[c, 2] * frames[c, 3]):
-            if drawn[at] > 0 and cells[at] == SEEN:
-                counts[c, drawn[at] - 1] += 1
+            first, last = _outline(parts, p, discs, height, left, right)
+            _fill(drawn[groups[p]], first, last, width, offset, left, right)
+        end = offset + width * height
+        for k in range(offset // WORD, words(end)):
+            some, several = np.uint64(0), np.uint64(0)
+            for g in range(count):
+                several |= some & drawn[g, k]
+                some |= drawn[g, k]
+            some &= between(offset, end, k)
+            if some == np.uint64(0):
+                continue
+            number = min(WORD, len(cells) - WORD * k)
+            not_bare = word_at_least(marks, 0, WORD * k, number, np.uint8(SEEN))
+            seen = not_bare & ~word_at_least(marks, 0, WORD * k, number, np.uint8(UNASKED)) & some
+            counts[c, count] += count_bits(seen)
+            counts[c, count + 1] += count_bits(some & ~not_bare)
+            for g in range(count):
+                counts[c, g] += count_bits(drawn[g, k] & seen & ~several)
     return counts
 
 
@@ -354,6 +369,6 @@ def draw_limbs(
             for n in range(len(limbs)):
                 for i in range(3):
                     discs[limbs[n], i] = moved[n, i]
-            _, bare[c, m] = draw_parts(parts, discs, frames[c], span, cells, drawn, m + 1, False)
+            _, bare[c, m] = draw_parts(parts, discs, frames[c], span, cells, drawn, m + 1)
             for n in range(begin, q):
                 covers[m, n] = drawn[asked[n]] == m + 1
