@@ -41,3 +41,17 @@ def test_known_blocks_are_not_found_again():
     known = blocks[np.random.default_rng(3).random(len(blocks)) < 0.4]
     new = blocks[near.not_among(blocks, known, lower, upper, LEAF)]
     assert {*map(tuple, new.tolist())} == {*map(tuple, blocks.tolist())} - {*map(tuple, known.tolist())}
+
+
+def test_cut_faces_against_numpy():
+    rng = np.random.default_rng(4)
+    for shape in ((2, 3, 4), (6, 5, 9), (3, 20, 17)):
+        sdf = rng.choice(np.array([-0.02, 0.01, 0.06], np.float32), shape)
+        for on_floor in (False, True):
+            expected = 0
+            for axis in range(3):
+                layers = np.moveaxis(sdf, axis, 0)
+                expected += ((layers[-2] < 0) & (layers[-1] >= np.float32(0.06))).sum()
+                if axis < 2 or not on_floor:
+                    expected += ((layers[1] < 0) & (layers[0] >= np.float32(0.06))).sum()
+            assert kernels.cut_faces(sdf, np.float32(0.06), on_floor) == expected

@@ -420,3 +420,25 @@ def voxels_below(sdf: Any, limit: Any, first: Any) -> tuple[Any, Any]:
                     values[at] = row[k]
                     at += 1
     return indices, values
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def cut_faces(sdf: Any, band_m: Any, on_floor: bool) -> int:
+    """How many voxels of the grid's outermost layers are clamped beside one that is inside; with `on_floor` but those
+    of the lowest layer."""
+    nx, ny, nz = sdf.shape
+    count = 0
+    for first, last in ((1, 0), (nx - 2, nx - 1)):
+        for j in range(ny):
+            for k in range(nz):
+                count += (sdf[first, j, k] < 0.0) & (sdf[last, j, k] >= band_m)
+    for first, last in ((1, 0), (ny - 2, ny - 1)):
+        for i in range(nx):
+            for k in range(nz):
+                count += (sdf[i, first, k] < 0.0) & (sdf[i, last, k] >= band_m)
+    for i in range(nx):
+        for j in range(ny):
+            count += (sdf[i, j, nz - 2] < 0.0) & (sdf[i, j, nz - 1] >= band_m)
+            if not on_floor:
+                count += (sdf[i, j, 1] < 0.0) & (sdf[i, j, 0] >= band_m)
+    return count

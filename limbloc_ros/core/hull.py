@@ -95,13 +95,8 @@ class Hull:
 
         Elsewhere the signed distance grows by no more than a voxel from voxel to voxel; there it jumps.
         """
-        faces = 0
-        for axis in range(3):
-            layers = np.moveaxis(self.sdf, axis, 0)  # no copies
-            first, second, before, last = layers[0], layers[1], layers[-2], layers[-1]
-            faces += int(np.count_nonzero((before < 0) & (last >= self.band_m)))
-            if axis < 2 or self.origin_m[2] > FLOOR_M:  # people stand and lie on the floor
-                faces += int(np.count_nonzero((second < 0) & (first >= self.band_m)))
+        on_floor = not self.origin_m[2] > FLOOR_M  # people stand and lie on the floor
+        faces = kernels.cut_faces(self.sdf, np.float32(self.band_m), on_floor)
         return float(faces) * self.voxel_m**2
 
     def shell(self) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
