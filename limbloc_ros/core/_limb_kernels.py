@@ -23,11 +23,13 @@ from limbloc_ros.core._many_parts_kernels import (
 from limbloc_ros.core._part_kernels import lay_out
 from limbloc_ros.core._search_kernels import CHUNK, chunk_scratch, depths_at, pop, push, spread_out
 
-#: Ragged masks eat into limbs: a bone may be thinner than expected by this fraction of its radius at no cost.
-EATEN = 0.4
+#: Ragged masks eat into limbs: where a bone is thinner than expected, up to this fraction of its radius counts little.
+#: It must count something: of bones that fit, the one that fills the hull best is to come first.
+EATEN, EATEN_WEIGHT = 0.4, 0.3
 #: A bone is looked at in so many places, and explained volume along it in so many.
 STEPS, LOOKS = 6, 4
-#: Bones that fit worse than this are no candidates (4 is the worst possible), nor those this much too short or long.
+#: Bones that fit worse than this are no candidates (little more than 4 is possible), nor those this much too short or
+#: long.
 WORST, STRETCHED = 3.2, 0.15
 #: The end's bone may turn back on the middle's up to this cosine: a limb does not fold onto itself.
 FOLDED = 0.87
@@ -161,7 +163,8 @@ def score_tubes(
 ) -> None:  # fmt: skip
     """How badly cones from `start` [3] to the ends ways[3:6] of the first `count` ways fit into the hull, to ways[6].
 
-    The mean clipped square of a cone's miss, from the fraction `skip` of the bone on: phi + radius, outside doubled.
+    The mean clipped square of a cone's miss, from the fraction `skip` of the bone on: phi + radius; where that is
+    positive, what masks may have eaten by EATEN_WEIGHT, and the rest doubled.
     """
     work, cells, corners = scratch
     ax, ay, az = start[0], start[1], start[2]
@@ -181,9 +184,10 @@ def score_tubes(
                 e = work[3 * CHUNK + n]
                 e += clip if e > 0.0 else 0.0  # the bone itself lies outside: constraint 3
                 e += radius
-                e = 2.0 * max(e - EATEN * radius, 0.0) if e > 0.0 else e
+                eaten = min(max(e, 0.0), EATEN * radius)
+                e = 2.0 * (e - eaten) if e > 0.0 else e
                 e = min(max(e, -clip), 2.0 * clip)
-                ways[6, first + n] += e * e
+                ways[6, first + n] += e * e + EATEN_WEIGHT * eaten * eaten
         for n in range(CHUNK):
             ways[6, first + n] /= norm
 
@@ -274,7 +278,7 @@ def search_limb(
     Candidates for the middle are medial points near the sphere (pulled onto it) and uniform directions; for the end
     likewise around each good middle. `forbidden` [4] is a direction and a cosine: first bones within it are not human.
 
-    Returns float64 [M, 7]: middle, end, score; the best first.
+    Returns float64 [M, 7]: middle, end, score; the best first, of equals the one whose bones came first.
     """
     points = candidates.T.copy()
     uniform = directions.T.copy()
@@ -288,7 +292,7 @@ def search_limb(
         (skip, 0.4), clip, explained_weight, ways, scratch,
     )  # fmt: skip
     middle = ways[3:, :count].T.copy()
-    chosen = spread_out(middle, np.argsort(middle[:, 3]), MIDDLES_APART * lengths[0], MIDDLES)
+    chosen = spread_out(middle, np.argsort(middle[:, 3], kind="mergesort"), MIDDLES_APART * lengths[0], MIDDLES)
     found = np.empty((len(chosen) * most, 7))
     scores = np.empty(len(found))
     heap = np.empty(len(found), np.int64)
@@ -297,7 +301,6 @@ def search_limb(
     back[3] = FOLDED
     kept = np.empty((keep, 7))
     best = 0
-    tied = False
     apart = LIMBS_APART * lengths[0]
     for c in range(len(chosen)):
         m = chosen[c]
@@ -325,17 +328,10 @@ def search_limb(
                 waiting += 1
         # Ends of later middles score no less than those: what is better is not waited for.
         settled = middle[chosen[c + 1], 3] if c + 1 < len(chosen) else math.inf
-        while waiting > 0 and scores[heap[0]] < settled and best < keep and not tied:
+        while waiting > 0 and scores[heap[0]] < settled and best < keep:
             n = pop(heap, waiting, scores)
             waiting -= 1
-            tied = waiting > 0 and scores[heap[0]] == scores[n]
             best += keep_new(found, n, kept, best, apart)
-        if best == keep and not tied:
+        if best == keep:
             break
-    if tied:  # the order of equals has always been that in which a sort of all leaves them, and figures depend on it
-        best = 0
-        for n in np.argsort(scores[:total]):
-            best += keep_new(found, n, kept, best, apart)
-            if best == keep:
-                break
     return kept[:best]
