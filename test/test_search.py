@@ -210,6 +210,50 @@ def test_torsos_between_seeds_against_one_by_one(person):
             assert np.abs(same - row).max(axis=1).min() < 1e-6
 
 
+def random_torsos(count):
+    rng = np.random.default_rng(17)
+    spread = np.array([0.3] * 3 + [0.8] * 3 + [0.4] * 6 + [0.1, 0.0])
+    return rng.normal(size=(count, 14)) * spread + np.array([0.0] * 12 + [0.5, 9.0])
+
+
+def test_a_placed_torso_against_the_figure():
+    """The torso of the mean figure, which is placed bone by bone with all its turns."""
+    table = search._torso_table()
+    parents = table.arrays[0]
+    exp = figure.kernels.exp_so3
+    for pose in random_torsos(20):
+        third, head, rest = exp(pose[6:9] / 3), exp(pose[9:12]), np.eye(3)
+        turns = np.array([exp(pose[3:6]), third, third, third, head] + [rest] * (len(parents) - 5))
+        expected = figure.kernels.forward(pose[:3], turns, pose[12:13], *table.arrays)[2:]
+        for here, there in zip(search.torso_kernels.place_torso(pose, *table.arrays), expected, strict=True):
+            np.testing.assert_allclose(here, there, atol=1e-12)
+
+
+def test_climbing_torsos_against_all_steps_in_full(person):
+    hull, table, torso_kernels = person.hull, search._torso_table(), search.torso_kernels
+    grid = (hull.sdf, hull.origin_m, hull.voxel_m)
+    spread = np.array([0.02] * 3 + [0.15] * 9 + [0.04])
+    better = 0
+    for n, start in enumerate(random_torsos(4)):
+        start[:3] = person.placed.origins[0] + 0.1 * start[:3]
+        noise = np.random.default_rng(n).normal(size=(60, 13))
+        best = start
+        for step, draw in enumerate(noise):
+            active = [range(13), range(6), (6, 7, 8, 12), (3, 4, 5, 9, 10, 11)][step % 4]
+            trial = best.copy()
+            trial[list(active)] += (draw * spread * (1 - 0.8 * step / 60))[list(active)]
+            spheres = torso_kernels.place_torso(trial, *table.arrays)
+            clip = 0.04 * np.exp(trial[12])
+            trial[13] = torso_kernels.torso_score(*grid, *spheres, table.weights, table.n_solid, clip)
+            bend, turn = (trial[6:9] ** 2).sum(), (trial[9:12] ** 2).sum()
+            trial[13] += 0.01 * (bend + turn) + 0.3 * (max(0.0, bend - 1.2) + max(0.0, turn - 0.8))
+            if trial[13] < best[13]:
+                best, better = trial, better + 1
+        found = torso_kernels.climb_torso(start, noise, *grid, table.arrays, table.weights, table.n_solid, spread)
+        np.testing.assert_allclose(found, best, atol=1e-9)
+    assert 8 < better < 200
+
+
 def test_different_torsos_against_numpy():
     rng = np.random.default_rng(15)
     poses = rng.normal(size=(300, 14)) * ([0.06] * 3 + [0.4] * 11)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from limbloc_ros.core._figure_kernels import exp_so3, forward, log_so3
+from limbloc_ros.core._figure_kernels import exp_so3, log_so3
 from limbloc_ros.core._search_kernels import CHUNK, chunk_scratch, depth_at, depths_at, pop, push
 
 #: A sphere's miss counts up to this fraction of the stature.
@@ -52,6 +52,42 @@ def torso_score(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
+def put_torso(
+    pose: Any, parents: Any, bone_offsets: Any, point_bones: Any, point_offsets: Any, point_radii: Any,
+    world: Any, origins: Any, points: Any, radii: Any,
+) -> None:  # fmt: skip
+    """`place_torso`, into arrays that are there: what `forward` does, but that only five bones are turned."""
+    scale = math.exp(pose[12])
+    third = exp_so3(pose[6:9] / 3.0)
+    head = exp_so3(pose[9:12])
+    world[0] = exp_so3(pose[3:6])
+    for i in range(3):
+        origins[0, i] = pose[i]
+    for b in range(1, len(parents)):
+        p = parents[b]
+        turn = head if b == 4 else third
+        for i in range(3):
+            at = origins[p, i]
+            for j in range(3):
+                at += world[p, i, j] * (bone_offsets[b, j, 0] * scale)
+            origins[b, i] = at
+            for j in range(3):
+                world[b, i, j] = world[p, i, j]
+                if b <= 4:
+                    world[b, i, j] = (
+                        world[p, i, 0] * turn[0, j] + world[p, i, 1] * turn[1, j] + world[p, i, 2] * turn[2, j]
+                    )
+    for n in range(len(point_bones)):
+        b = point_bones[n]
+        for i in range(3):
+            at = origins[b, i]
+            for j in range(3):
+                at += world[b, i, j] * (point_offsets[n, j, 0] * scale)
+            points[n, i] = at
+        radii[n] = point_radii[n, 0] * scale
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def place_torso(
     pose: Any, parents: Any, bone_offsets: Any, point_bones: Any, point_offsets: Any, point_radii: Any
 ) -> Any:
@@ -59,22 +95,9 @@ def place_torso(
 
     The bend is the whole turn from pelvis to chest, spread over the three spine joints.
     """
-    nb = len(parents)
-    rotations = np.zeros((nb, 3, 3))
-    for b in range(nb):
-        for i in range(3):
-            rotations[b, i, i] = 1.0
-    rotations[0] = exp_so3(pose[3:6])
-    third = exp_so3(pose[6:9] / 3.0)
-    rotations[1] = third
-    rotations[2] = third
-    rotations[3] = third
-    rotations[4] = exp_so3(pose[9:12])
-    shape = np.empty(1)
-    shape[0] = pose[12]
-    _, _, points, radii = forward(
-        pose[:3], rotations, shape, parents, bone_offsets, point_bones, point_offsets, point_radii
-    )
+    points, radii = np.empty((len(point_bones), 3)), np.empty(len(point_bones))
+    world, origins = np.empty((len(parents), 3, 3)), np.empty((len(parents), 3))
+    put_torso(pose, parents, bone_offsets, point_bones, point_offsets, point_radii, world, origins, points, radii)
     return points, radii
 
 
@@ -338,6 +361,9 @@ def climb_torso(
 ) -> Any:
     """Hill climbing of one search pose [14] with given normal noise [steps, 13]; steps shrink on the way."""
     parents, bone_offsets, point_bones, point_offsets, point_radii = table
+    points, radii = np.empty((len(point_bones), 3)), np.empty(len(point_bones))
+    world, origins = np.empty((len(parents), 3, 3)), np.empty((len(parents), 3))
+    whole = weights.sum()
     best = start.copy()
     trial = best.copy()
     steps = len(noise)
@@ -353,11 +379,25 @@ def climb_torso(
                 or (group == 3 and ((i >= 3 and i < 6) or (i >= 9 and i < 12)))
             )
             trial[i] = best[i] + (noise[n, i] * spread[i] * shrink if active else 0.0)
-        points, radii = place_torso(trial[:13], parents, bone_offsets, point_bones, point_offsets, point_radii)
-        score = torso_score(sdf, origin, voxel, points, radii, weights, n_solid, 0.04 * math.exp(trial[12]))
         bend = trial[6] * trial[6] + trial[7] * trial[7] + trial[8] * trial[8]
         turn = trial[9] * trial[9] + trial[10] * trial[10] + trial[11] * trial[11]
-        score += 0.01 * bend + 0.01 * turn + 0.3 * max(0.0, bend - 1.2) + 0.3 * max(0.0, turn - 0.8)
+        unusual = 0.01 * bend + 0.01 * turn + 0.3 * max(0.0, bend - 1.2) + 0.3 * max(0.0, turn - 0.8)
+        clip = CLIP * math.exp(trial[12])
+        norm = whole * clip * clip
+        enough = (best[13] - unusual + 1e-9) * norm  # with more missed it is no better, whatever the roundings
+        total = 0.0
+        if total < enough:
+            put_torso(
+                trial, parents, bone_offsets, point_bones, point_offsets, point_radii, world, origins, points, radii
+            )
+            for m in range(len(points)):
+                phi = depth_at(sdf, origin, voxel, points[m, 0], points[m, 1], points[m, 2])
+                total += weights[m] * misfit(phi, radii[m], m < n_solid, clip)
+                if total >= enough:
+                    break
+        if total >= enough:
+            continue
+        score = total / norm + unusual
         if score < best[13]:
             best[:13] = trial[:13]
             best[13] = score
