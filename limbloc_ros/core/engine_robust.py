@@ -77,7 +77,7 @@ class Effort:
     candidates: int = 80
     quick_points: int = 350
     points: int = 1000
-    iterations: tuple[int, int, int, int, int] = (3, 4, 5, 3, 8)
+    iterations: tuple[int, int, int, int, int] = (3, 5, 6, 4, 12)
     lenient_limits: float = 3e-3
     enough: float = 3.4e-4
     certain: float = 0.0

@@ -79,9 +79,10 @@ class Tracker:
     #: Then a limb that settles where it was counts as well: it may have come back along a better way.
     LIMB_DOUBT, MORE_STEPS, LONGEST_DOUBT = 1.25, 10, 8
     #: The figure is carried along by so many steps, or by more when it has moved by 10 cm, with the firm weights of
-    #: the search, which lead from further off; so many more with the final ones put its joints in their places. (With
-    #: limbs checked in every third frame wrists of raised arms stay 10 to 20 cm behind in rough hulls.)
-    STEPS, FAR_STEPS, FINAL_STEPS = 5, 12, 4
+    #: the search, which lead from further off; so many more with the final ones put its joints in their places. (With 5
+    #: and 4, or 8 and 4, a wrist is 10 to 18 cm off in 4 and 8 of 1320 frames, with these in none; with limbs checked
+    #: in every third frame wrists of raised arms stay as far behind in rough hulls.)
+    STEPS, FAR_STEPS, FINAL_STEPS = 8, 20, 6
     #: People do not change their size, and one hull says little of it: what a deviation of one standard deviation from
     #: the mean shape so far costs (m^2) per frame in that mean, and how many frames count.
     SIZE_WEIGHT, REMEMBERED = 2e-5, 20
