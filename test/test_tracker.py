@@ -149,7 +149,7 @@ def test_an_arm_that_slipped_into_the_trunk_is_found_again(monkeypatch):
     wrist = []
     for checks in (True, False):
         if not checks:
-            monkeypatch.setattr(Tracker, "_check_limbs", lambda self, limbs, result, *others: result)
+            monkeypatch.setattr(Tracker, "_check_limbs", lambda self, limbs, places, result, *others: result)
         follower = Tracker(seed=0)
         follow(follower, 20)
         follower._last = slipped
@@ -218,8 +218,9 @@ class Stand:
         self.guessed.append((self.frame, state))
         return SimpleNamespace(cost=self.costs.get(self.frame, 1e-4))
 
-    def check(self, limbs, result, hull, surface, evidence, size, settled_m):
-        assert settled_m == (0.0 if len(limbs) == 4 else SETTLED_M)
+    def check(self, limbs, places, result, hull, surface, evidence, size, settled_m):
+        hasty = len(limbs) == 4
+        assert (settled_m, places) == ((0.0, Tracker.HASTY_PLACES) if hasty else (SETTLED_M, Tracker.PLACES))
         self.checked.append((self.frame, [f"{kind.bones[0]}_{side}" for kind, side in limbs]))
         return SimpleNamespace(**vars(result)) if self.frame in self.found else result
 

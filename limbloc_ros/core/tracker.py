@@ -71,9 +71,9 @@ class Tracker:
         ),
         HARDER,
     )  # fmt: skip
-    #: Every so many frames one of the limbs has its turn to be looked for elsewhere, in so many places; by how much of
-    #: the energy it and what the silhouettes add must be lower there.
-    TURN, PLACES, LIMB_GAIN = 2, 1, 0.03
+    #: Every so many frames one of the limbs has its turn to be looked for elsewhere, in so many places, and in so many
+    #: when all are; by how much of the energy it and what the silhouettes add must be lower there.
+    TURN, PLACES, HASTY_PLACES, LIMB_GAIN = 2, 1, 2, 0.03
     #: When the cost is so much above the usual one, the figure is first carried on by so many steps, and then all limbs
     #: are checked at once; each time in vain, the wait doubles, up to this, unless the cost rises as much once more.
     #: Then a limb that settles where it was counts as well: it may have come back along a better way.
@@ -215,7 +215,8 @@ class Tracker:
             self._turn = (self._turn + 1) % len(LIMBS)
         else:
             return result
-        checked = self._check_limbs(limbs, result, hull, surface, evidence, size, 0.0 if hasty else SETTLED_M)
+        places, settled_m = (self.HASTY_PLACES, 0.0) if hasty else (self.PLACES, SETTLED_M)
+        checked = self._check_limbs(limbs, places, result, hull, surface, evidence, size, settled_m)
         self._next_check = self._frame + self.TURN
         if checked is not result:
             self._doubt_wait, self._next_doubt = 1, self._frame + 1
@@ -227,6 +228,7 @@ class Tracker:
     def _check_limbs(
         self,
         limbs: Sequence[tuple[LimbKind, str]],
+        places: int,
         result: Result,
         hull: Hull,
         surface: Surface,
@@ -237,7 +239,7 @@ class Tracker:
         """The figure, or it with one of these limbs after the other elsewhere, but for those that settle near it."""
         scene = make_scene(hull, Medial.of(hull), surface, self._seed, self._weights, QUICK)
         for kind, side in limbs:
-            for state in with_one_limb(result.state, scene, kind, side, self.PLACES, QUICK.candidates):
+            for state in with_one_limb(result.state, scene, kind, side, places, QUICK.candidates):
                 if apart_m(state, result.state) < SAME_PLACE_M:
                     continue
                 settled = refine(state, scene.quick, scene.lenient, 5, (size,)).state
