@@ -38,6 +38,19 @@ def test_what_is_remembered_of_the_last_figure_changes_nothing(case, step_m):
         np.testing.assert_array_equal(known.matrix, anew.matrix)
 
 
+def test_a_figure_that_is_nowhere_leaves_nothing_behind(case):
+    """Numbers that are none, as of a step that could not be worked out, cost no number and are forgotten."""
+    truth, evidence, state = case
+    terms = only(surface=1.0)
+    nowhere = dataclasses.replace(state, root=np.full(3, np.nan))
+    known = dataclasses.replace(evidence)
+    for figure_there in (state, truth):
+        assert np.isnan(energy.system(nowhere, known, terms).cost)
+        there, anew = (energy.system(figure_there, seen, terms) for seen in (known, dataclasses.replace(evidence)))
+        assert there.cost == anew.cost
+        np.testing.assert_array_equal(there.matrix, anew.matrix)
+
+
 def test_the_true_figure_explains_its_own_surface(case):
     truth, evidence, state = case
     assert energy.system(truth, evidence, only(surface=1.0)).cost < 1e-12

@@ -261,3 +261,14 @@ def test_what_no_views_pack_is_refused():
     ):
         with pytest.raises(InputError):
             Views.unpacked(broken)
+
+
+def test_a_part_beside_the_last_image_is_drawn_nowhere():
+    """Its cells would begin behind the last one, which may be the last of a word: there is room for two words more."""
+    drawn = np.zeros(3, np.uint64)  # as `covered` has it for 8 x 8 cells
+    left, right = np.full(8, 9.5), np.full(8, 12.0)
+    kernels._fill.py_func(drawn, 7, 7, 8, 0, left, right)  # Python minds where it writes
+    assert not drawn.any()
+    left, right = np.full(8, 2.0), np.full(8, 12.0)
+    kernels._fill.py_func(drawn, 7, 7, 8, 0, left, right)
+    assert [cell for cell in range(64) if int(drawn[0]) >> cell & 1] == list(range(58, 64))

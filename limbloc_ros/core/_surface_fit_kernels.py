@@ -12,7 +12,7 @@ from numba import njit
 from limbloc_ros.core._many_parts_kernels import BUFFER, LANES, put_pair, settle_pairs
 from limbloc_ros.core._part_kernels import SLACK, distance_to_part, lay_out
 
-#: A figure that has moved by more than this, m, is looked at anew.
+#: A figure that has moved by more than this in one step, m, is looked at anew.
 FORGET_M = 0.1
 
 
@@ -88,7 +88,7 @@ def go_on(parts: Any, spheres: Any, radii: Any, spheres_then: Any, radii_then: A
     for p in range(len(parts)):
         by = max(by_sphere[parts[p, 0]], by_sphere[parts[p, 1]], by_sphere[parts[p, 2]])
         way[p] += np.float32(by + SLACK)
-        most = max(most, by)
+        most = by if by > most or by != by else most  # a number that is none is never forgotten
     return most
 
 

@@ -265,7 +265,7 @@ def covered(parts: Any, centres: Any, radii: Any, cams: Any, frames: Any, seen: 
     Cells are bits here, from the lowest one of the first word on, in all words of `seen` and of `bare`: what is drawn
     over and over is ored, and all is counted in the end.
     """
-    drawn = np.zeros(len(seen) + 1, np.uint64)
+    drawn = np.zeros(len(seen) + 2, np.uint64)  # a part beside an image is drawn with no bits, behind its last cell
     # only the balls of these parts
     place = np.full(len(centres), -1)
     balls = np.empty((len(centres), 4))
@@ -307,7 +307,7 @@ def draw_groups(
     """
     discs = np.empty((len(centres), 3))
     left, right = np.empty((2, max(1, frames[:, 3].max())))
-    drawn = np.zeros((count, words(len(cells)) + 1), np.uint64)  # as in `covered`
+    drawn = np.zeros((count, words(len(cells)) + 2), np.uint64)  # as in `covered`
     marks = cells.reshape(1, len(cells))
     counts = np.zeros((len(frames), count + 2), np.int64)
     for c in range(len(frames)):

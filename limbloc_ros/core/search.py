@@ -305,7 +305,7 @@ def limb_candidates(
     forbidden = np.append(no_go / np.linalg.norm(no_go), 0.97 if kind is ARM else 0.6)
     near = kernels.points_near(medial.points, base, 1.2 * lengths.sum())
     if len(near) > 500:
-        near = near[:: len(near) // 500 + 1]
+        near = np.ascontiguousarray(near[:: len(near) // 500 + 1])  # of another layout kernels are compiled anew
     found = limb_kernels.search_limb(
         base, lengths, radii, tip_m, near, sphere_directions(100), hull.sdf, hull.origin_m, hull.voxel_m,
         explained, STRIDE, HIDDEN, 0.04, EXPLAINED_WEIGHT, forbidden, keep,

@@ -82,7 +82,7 @@ class CarvingNode(Node):
         else:
             volume = (s.volume_min, s.volume_max)
             self.rig_source = RigFromTopics(
-                self, s.cameras, s.world_frame, volume, self.hull_config.min_cameras, self.use_rig
+                self, s.cameras, s.world_frame, volume, self.hull_config.min_cameras, self.on_rig
             )
         mask_topics = {name: self.mask_topic(name) for name in s.cameras or (self.rig.names if self.rig else ())}
         self.report = CarvingReport(self, mask_topics)
@@ -100,6 +100,11 @@ class CarvingNode(Node):
         """Where a camera's masks come from."""
         raw = self.settings.mask_transport == "raw"
         return topics.mask(camera) if raw else topics.mask_compressed(camera)
+
+    def on_rig(self, rig: Rig) -> None:
+        """The rig came by topics, or has changed there."""
+        self.use_rig(rig)
+        self.report.watch(rig)
 
     def use_rig(self, rig: Rig) -> None:
         """Carve with this rig from now on.

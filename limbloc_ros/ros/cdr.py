@@ -21,6 +21,7 @@ from sensor_msgs.msg import CompressedImage, Image
 from limbloc_ros.core.errors import InputError
 from limbloc_ros.core.images import Pixels
 from limbloc_ros.core.mask_png import encode_mask
+from limbloc_ros.core.pose import JOINT_NAMES
 from limbloc_ros.core.synchroniser import NANOSECONDS
 from limbloc_ros.ros.image_messages import MASK_FORMAT, pixels_to_image
 from limbloc_ros.ros.messages import make_header
@@ -50,7 +51,7 @@ class SentCompressed:
     data: memoryview
 
 
-def read_sent(kind: type[Image] | type[CompressedImage], cdr: bytes) -> SentImage | SentCompressed:
+def read_sent(kind: type[Image] | type[CompressedImage], cdr: bytes | bytearray) -> SentImage | SentCompressed:
     """What a raw subscription to messages of this kind got.
 
     Raises:
@@ -74,7 +75,7 @@ def read_sent(kind: type[Image] | type[CompressedImage], cdr: bytes) -> SentImag
 class _Fields:
     """Reads the fields of a message one after the other."""
 
-    def __init__(self, cdr: bytes) -> None:
+    def __init__(self, cdr: bytes | bytearray) -> None:
         self._cdr, self._at = cdr, 4  # numbers are aligned from there on, which is aligned itself
         self._order = "<" if cdr[1] else ">"
 
@@ -104,7 +105,9 @@ def mask_cdr(mask: Pixels, stamp_ns: int, frame_id: str) -> bytes:
 
 
 def joints_cdr(joints: NDArray[np.float64] | None, stamp_ns: int, frame_id: str) -> bytes:
-    """What publishes the same as `messages.joints_to_message`."""
+    """What publishes the same as `messages.joints_to_message`, joints of another shape than [25, 3] refused."""
+    if joints is not None and joints.shape != (len(JOINT_NAMES), 3):
+        raise InputError(f"expected joints of shape ({len(JOINT_NAMES)}, 3), got {joints.shape}")
     poses = np.zeros((0 if joints is None else len(joints), 7))  # x y z, and a quaternion x y z w
     if joints is not None:
         poses[:, :3], poses[:, 6] = joints, 1.0
@@ -112,7 +115,7 @@ def joints_cdr(joints: NDArray[np.float64] | None, stamp_ns: int, frame_id: str)
     cdr += bytes(-len(cdr) % 4) + struct.pack("<I", len(poses))
     if len(poses):
         cdr += bytes((4 - len(cdr)) % 8)  # doubles are aligned behind the first four bytes
-    return bytes(cdr + poses.tobytes())
+    return bytes(cdr + poses.astype("<f8").tobytes())
 
 
 def _begin(stamp_ns: int, frame_id: str) -> bytearray:
@@ -149,4 +152,5 @@ class ImageCdr(StampedCdr):
     def __init__(self, height: int, width: int, frame_id: str) -> None:
         empty = np.zeros((height, width, 3), np.uint8)
         super().__init__(pixels_to_image(empty, make_header(0, frame_id)))
-        self.pixels: Pixels = np.frombuffer(self._cdr, np.uint8)[-empty.size :].reshape(empty.shape)  # the last field
+        data = read_sent(Image, self._cdr).data
+        self.pixels: Pixels = np.frombuffer(data, np.uint8).reshape(empty.shape)
