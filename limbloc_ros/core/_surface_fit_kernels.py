@@ -135,9 +135,7 @@ def explaining_parts(
     pairs = np.zeros((2, LANES, 2), np.int64)
     filled = np.zeros(2, np.int64)
     for q in range(count):
-        along = normals[q, 0] * rays[q, 0] + normals[q, 1] * rays[q, 1] + normals[q, 2] * rays[q, 2]
-        for i in range(3):
-            facing[q, i] = normals[q, i] - along * rays[q, i]
+        facing[q, 0], facing[q, 1], facing[q, 2] = across(normals[q], rays[q])
         kind = int(rows[hints[q], 0] == 3.0)
         put_pair(buffers, pairs, kind, filled[kind], query, facing, rays, q, rows, hints[q])
         filled[kind] += 1

@@ -36,6 +36,15 @@ def _seem_nearest(buffer: Any, bounds: Any) -> None:
             buffer[PART + i] = number if nearer else buffer[PART + i]
 
 
+@njit(cache=True, inline="always", error_model="numpy")  # type: ignore[misc, unused-ignore]
+def _may_be_as_near(bounds: Any, p: int, x: float, y: float, z: float, ray: Any, nearest: float) -> bool:
+    """Whether the sphere around part p lets it be as near to a ray as `nearest`."""
+    bx, by, bz = bounds[0, p] - x, bounds[1, p] - y, bounds[2, p] - z
+    along = bx * ray[0] + by * ray[1] + bz * ray[2]
+    reach = nearest + bounds[3, p] + SLACK
+    return bx * bx + by * by + bz * bz - along * along <= reach * reach  # type: ignore[no-any-return]
+
+
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
 def _farthest_in_turn(points: Any, rays: Any, rows: Any, bounds: Any, counts: Any) -> float:
     """`farthest`, point by point: of two parts that are as near, what explained the point before goes on to."""
@@ -47,10 +56,7 @@ def _farthest_in_turn(points: Any, rays: Any, rows: Any, bounds: Any, counts: An
         nearest, _, _ = distance_to_part(rows[hint], x, y, z, ray)
         p = 0
         while nearest > most and p < len(rows):
-            bx, by, bz = bounds[0, p] - x, bounds[1, p] - y, bounds[2, p] - z
-            along = bx * ray[0] + by * ray[1] + bz * ray[2]
-            reach = nearest + bounds[3, p] + SLACK
-            if bx * bx + by * by + bz * bz - along * along <= reach * reach:
+            if _may_be_as_near(bounds, p, x, y, z, ray, nearest):
                 d, _, _ = distance_to_part(rows[p], x, y, z, ray)
                 if d < nearest:
                     nearest, hint = d, p
@@ -92,10 +98,7 @@ def farthest(points: Any, rays: Any, parts: Any, spheres: Any, radii: Any, count
         ray = rays[q]
         nearest, hint, as_near = within[q], hints[q], False
         for p in range(len(rows)):
-            bx, by, bz = bounds[0, p] - x, bounds[1, p] - y, bounds[2, p] - z
-            along = bx * ray[0] + by * ray[1] + bz * ray[2]
-            reach = nearest + bounds[3, p] + SLACK
-            if bx * bx + by * by + bz * bz - along * along <= reach * reach:
+            if _may_be_as_near(bounds, p, x, y, z, ray, nearest):
                 d, _, _ = distance_to_part(rows[p], x, y, z, ray)
                 if d < nearest:
                     nearest, hint, as_near = d, p, False
