@@ -31,12 +31,13 @@ from limbloc_ros.ros.process_starter import LONGEST
 PATIENCE_S = 4.0
 
 #: What each kind of node works with, of ours and with all that comes along, but ROS; a function loads kernels. (The
-#: first kernel of all brings much of numba along, so some are loaded before the first process is forked.)
+#: first kernel of all brings much of numba along, so some are loaded before the first process is forked. What nobody
+#: else needs, the kernels of the fit, the pose node loads itself: meanwhile the others start, and find it by DDS.)
 NEEDED = {
     "simulated_cameras": ("simulation.room", "simulation.company", "rig.rig_file", "core.background:warm_up"),
     "segmentation": ("recordings.background_file", "recordings.videos", "core.background:warm_up"),
     "carving": ("rig.rig_file", "rig.watch", "core.synchroniser", "core.pipeline:Carver.warm_up"),
-    "pose": ("core.people", "core.ros4hri", "core.parts:warm_up", "core.pipeline:PoseEstimator.warm_up"),
+    "pose": ("core.people", "core.ros4hri", "core.pipeline:Carver.warm_up"),
     "replay": ("recordings.bags",),
     "record": ("recordings.bags",),
 }
