@@ -71,3 +71,25 @@ def test_scores_are_those_of_whole_images(folder, degrees):
             np.testing.assert_array_equal(scores.without, without)
             np.testing.assert_array_equal(scores.unexplained, unexplained)
             np.testing.assert_array_equal(scores.alone, alone)
+
+
+@pytest.mark.parametrize(
+    ("model", "lens"),
+    [
+        ("radtan", (-0.2, 0.05, 0.001, -0.002)),
+        ("fisheye", (0.05, -0.01, 0.002, 0.001)),
+        ("rational", (-0.1, 0.02, 0.0, 0.0, 0.0, 0.1, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.05, -0.04)),  # a tilted sensor
+    ],
+)
+def test_points_are_looked_up_where_the_camera_sees_them(model, lens):
+    K = np.array([[150.0, 0.0, 119.5], [0.0, 152.0, 89.5], [0.0, 0.0, 1.0]])
+    camera = Camera("cam", 240, 180, K, np.eye(4), np.array(lens), model)
+    points = np.random.default_rng(3).uniform([-2, -2, -1], [2, 2, 4], (500, 3))
+    points[0] = 0, 0, 2
+    found = consistency.look_up(camera, points)
+    uv, depth = camera.world_to_image(points)
+    beside = np.abs(points[:, :2]) > 1.4 * np.array([240, 180]) / K[[0, 1], [0, 1]] * points[:, 2:]
+    for n, (u, v) in enumerate(uv):
+        x, y = (-1, -1) if depth[n] <= 0 or beside[n].any() else (round(u), round(v))
+        assert found[n] == (y * 240 + x if 0 <= x < 240 and 0 <= y < 180 else -1)
+    assert (found >= 0).sum() > 30

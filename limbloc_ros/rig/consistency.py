@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from limbloc_ros.core._silhouettes_kernels import bounds
 from limbloc_ros.core.camera import Camera, Rig
+from limbloc_ros.core.lens import distort
 from limbloc_ros.rig import _consistency_kernels as kernels
 
 Array = NDArray[np.float64]
@@ -151,10 +152,12 @@ def look_up(camera: Camera, points: Array) -> NDArray[np.int32]:
     ahead = points @ T[:3, :3].T + T[:3, 3]
     depth = ahead[:, 2]
     plain = ahead[:, :2] / np.where(depth > 0, depth, np.inf)[:, None]
-    if camera.distortion.any():
-        uv = np.nan_to_num(camera.world_to_image(points)[0], nan=-1.0, posinf=-1.0, neginf=-1.0)
+    if camera.distortion[12:].any():  # a tilted sensor
+        uv = camera.world_to_image(points)[0]
     else:  # many times as fast
-        uv = plain * camera.K[[0, 1], [0, 1]] + camera.K[[0, 1], [2, 2]]
+        bent = distort(camera, plain) if camera.distortion.any() else plain
+        uv = bent * camera.K[[0, 1], [0, 1]] + camera.K[[0, 1], [2, 2]]
+    uv = np.nan_to_num(uv, nan=-1.0, posinf=-1.0, neginf=-1.0)
     x, y = np.rint(uv).clip(-1e6, 1e6).astype(np.int64).T
     # Distortion folds far points back into the image: only those near it without distortion can be in it.
     limit = 1.4 * np.array([camera.width, camera.height]) / camera.K[[0, 1], [0, 1]]
