@@ -25,12 +25,15 @@ from limbloc_ros.core.tracker import Tracker
 #: Calls every kernel of a search once.
 _LEAST_EFFORT = engine_robust.Effort(
     torsos=1, leg_pairs=1, starts=1, survivors=1, arm_repairs=1, strict=1, single_arms=1, single_legs=1, rounds=1,
-    finalists=1, quick_points=50, points=50, iterations=(1, 1, 1, 1, 1),
+    finalists=1, candidates=8, quick_points=50, points=50, iterations=(1, 1, 1, 1, 1),
 )  # fmt: skip
 
 
 class _Trusting(Tracker):
-    """Does not search again for what it found, which would call the same kernels once more."""
+    """Takes single steps, and does not search again for what it found: more only calls the same kernels once more."""
+
+    STEPS = FAR_STEPS = MORE_STEPS = FINAL_STEPS = 1
+    DOUBTFUL_COST = LIMB_DOUBT = float("inf")  # one limb is looked for, not all
 
     def _doubts(self, cost: float, cut: bool) -> bool:
         return False
