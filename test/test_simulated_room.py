@@ -16,7 +16,7 @@ from limbloc_ros.simulation import _render_kernels as kernels
 from limbloc_ros.simulation.company import chair, company
 from limbloc_ros.simulation.person import PERSON_NAMES, load_person
 from limbloc_ros.simulation.room import SimulatedRoom, default_rig
-from limbloc_ros.simulation.surroundings import backdrop
+from limbloc_ros.simulation.surroundings import backdrop, camera_rays
 
 
 @pytest.fixture(scope="module")
@@ -132,15 +132,33 @@ def test_left_and_right_look_different_from_the_front() -> None:
     assert mask[int(wrist[1]), int(wrist[0])] == 255
 
 
+LENSES = [
+    ("none", []),
+    ("radtan", [-0.2, 0.05, 0.002, -0.003]),
+    ("radtan", [-0.2, 0.05, 0.002, -0.003, 0.01]),
+    ("rational", [0.1, -0.05, 0.001, 0.002, 0.01, 0.2, 0.03, -0.01]),
+]
+
+
 @pytest.mark.parametrize(
     ("model", "coefficients"),
     [
-        ("none", []),
-        ("radtan", [-0.2, 0.05, 0.002, -0.003]),
-        ("radtan", [-0.2, 0.05, 0.002, -0.003, 0.01]),
-        ("rational", [0.1, -0.05, 0.001, 0.002, 0.01, 0.2, 0.03, -0.01]),
+        *LENSES,
+        ("radtan", [-2.0, 0.0, 0.0, 0.0]),  # folds within the image
+        ("radtan", [3.0, -40.0, 0.0, 0.0]),
+        ("rational", [0.1, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.01, 0.02, -0.01, 0.005]),
     ],
 )
+def test_rays_are_opencvs(model: str, coefficients: list[float]) -> None:
+    base = default_rig(3).cameras[1]
+    camera = Camera("c", 64, 48, np.diag([0.1, 0.1, 1.0]) @ base.K, base.T_world_camera, np.array(coefficients), model)
+    pixels = np.stack(np.meshgrid(np.arange(64.0), np.arange(48.0)), axis=-1)
+    flat = cv2.undistortPoints(pixels.reshape(-1, 1, 2), camera.K, camera.distortion).reshape(48, 64, 2)
+    wanted = np.concatenate([flat, np.ones((48, 64, 1))], axis=-1) @ camera.T_world_camera[:3, :3].T
+    np.testing.assert_allclose(camera_rays(camera), np.moveaxis(wanted, -1, 0), rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize(("model", "coefficients"), LENSES)
 def test_the_fast_projection_equals_the_cameras(model: str, coefficients: list[float]) -> None:
     base = default_rig(3).cameras[1]
     camera = Camera("c", 640, 480, base.K, base.T_world_camera, np.array(coefficients), model)

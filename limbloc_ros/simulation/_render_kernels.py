@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernels of `room`: shading, a z-buffer rasteriser, shadow on the floor, soft edges, noise.
+"""Kernels of `room` and `surroundings`: rays, shading, a z-buffer rasteriser, shadow on the floor, soft edges, noise.
 
 All trust their callers; images are uint8 [H, W, 3] bgr, boxes are x0, y0, x1, y1 with the ends left out.
 """
@@ -40,6 +40,30 @@ def project(points: Array, R: Array, t: Array, K: Array, k: Array, uv: Array, de
         yd = y * radial + k[2] * (r2 + 2 * y * y) + 2 * k[3] * x * y
         uv[v, 0] = K[0, 0] * xd + K[0, 1] * yd + K[0, 2]
         uv[v, 1] = K[1, 1] * yd + K[1, 2]
+
+
+@njit(cache=True, error_model="numpy")
+def cast_rays(K: Array, k: Array, R: Array, rays: Floats) -> None:
+    """Directions [3, H, W] of the pixels in world axes, depth 1 along the camera's axis; k as in `project`.
+
+    As OpenCV's undistortPoints, which takes three times as long, by five steps of a fixed-point iteration; R is
+    R_world_camera.
+    """
+    for v in range(rays.shape[1]):
+        for u in range(rays.shape[2]):
+            a = x = (u - K[0, 2]) / K[0, 0]
+            b = y = (v - K[1, 2]) / K[1, 1]
+            for _ in range(5):
+                r2 = x * x + y * y
+                radial = (1 + r2 * (k[5] + r2 * (k[6] + r2 * k[7]))) / (1 + r2 * (k[0] + r2 * (k[1] + r2 * k[4])))
+                if radial < 0:
+                    x, y = a, b
+                    break
+                xd = a - (2 * k[2] * x * y + k[3] * (r2 + 2 * x * x))
+                yd = b - (k[2] * (r2 + 2 * y * y) + 2 * k[3] * x * y)
+                x, y = xd * radial, yd * radial
+            for axis in range(3):
+                rays[axis, v, u] = R[axis, 0] * x + R[axis, 1] * y + R[axis, 2]
 
 
 @njit(cache=True, error_model="numpy")
