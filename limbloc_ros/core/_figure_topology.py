@@ -185,34 +185,3 @@ CLOTHING: dict[str, dict[str, float]] = {
         "calf": 0.014,
     },
 }
-
-#: Visual hulls are larger than bodies, most of all in the bends of knees and elbows, and flesh made of few spheres
-#: cannot follow. So a figure fitted to a hull has its joints beside the true ones, by the same few millimetres for
-#: everybody. These are taken back: where in the flesh bones turn (limbs stay straight, see `figure._shift_joints`), and
-#: where the other joints are. In the axes of the bone before, m for a stature of 1.75 m; from fits to 303 hulls with
-#: known joints, two thirds of them of our own people.
-PIVOT_SHIFTS: dict[str, tuple[float, float, float]] = dict(
-    _both(
-        [
-            ("shin_L", (-0.0035, -0.001, -0.0063)),
-            ("foot_L", (0.0055, 0.0008, -0.0035)),
-            ("upper_arm_L", (0.004, 0.0, 0.004)),
-            ("forearm_L", (0.0015, 0.001, -0.005)),
-            ("hand_L", (0.0, 0.0, -0.011)),
-        ]
-    )
-)
-JOINT_SHIFTS: dict[str, tuple[float, float, float]] = dict(
-    [
-        ("head_centre", (-0.004, 0.0, 0.003)),
-        ("torso_centre", (-0.005, 0.0, 0.0)),
-        *_both(
-            [
-                ("hand_L", (0.001, 0.019, -0.005)),
-                ("fingertip_L", (-0.004, 0.030, -0.019)),
-                ("toe_L", (0.003, 0.008, -0.015)),
-                ("heel_L", (0.002, -0.003, 0.001)),
-            ]
-        ),
-    ]
-)

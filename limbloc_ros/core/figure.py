@@ -2,9 +2,9 @@
 """The stick and flesh figure: state -> bones, joints, flesh (paper section 2.2, Table 1; see docs/model.md).
 
 Bones are rigid frames that turn in their parents; a person's size is a scale and ten weights of the directions in
-which people differ (`proportions.npz`, made by `tools/fit_proportions.py`), so left and right are the same size
-(constraint 2) and lengths and girths stay human (constraint 1). The flesh is a union of convex hulls of one, two or
-three spheres that ride on the bones.
+which people differ (`proportions.npz`, made by `tools/fit_proportions.py` and `tools/fit_flesh.py`), so left and
+right are the same size (constraint 2) and lengths and girths stay human (constraint 1). The flesh is a union of convex
+hulls of one, two or three spheres that ride on the bones; it is fitted to visual hulls, not to skins.
 """
 
 from __future__ import annotations
@@ -22,9 +22,7 @@ from limbloc_ros.core._figure_topology import (
     BONES,
     CLOTHING,
     JOINT_BONES,
-    JOINT_SHIFTS,
     PARTS,
-    PIVOT_SHIFTS,
     SPHERES,
 )
 from limbloc_ros.core.pose import JOINT_NAMES, Flesh
@@ -109,45 +107,14 @@ def proportions() -> Proportions:
         mean, std = (float(value) for value in table["log_stature"])
         clothing = np.zeros((len(radii), len(CLOTHING)))
         clothing[: len(SPHERES)] = _clothing_radii()
-        origins = table["bone_offsets"].astype(np.float64)
-        _shift_joints(origins, bones, offsets)
         return Proportions(
-            _with_modes(origins),
+            _with_modes(table["bone_offsets"].astype(np.float64)),
             np.array(bones, np.int64),
             _with_modes(offsets),
             np.concatenate([radii, clothing], axis=-1),
             mean,
             std,
         )
-
-
-def _shift_joints(bone_offsets: Array, point_bones: list[int], point_offsets: Array) -> None:
-    """Move pivots within the flesh, and joints, as the topology says, in place.
-
-    The bones of a limb have their pivots on one line, from which all angles are counted. Along it pivots move and the
-    flesh stays where it is while nothing is bent. Where a pivot inside a limb should move across the line, the flesh
-    around it moves the other way instead; where the limb's first pivot does, the whole line moves.
-    """
-    unmoved, heights = bone_offsets[:, :, 0].copy(), point_offsets[:, 2, 0].copy()
-    carriers = np.array(point_bones)
-    marks_pivot = (np.arange(len(carriers)) >= N_SPHERES) & ~point_offsets.any(axis=(1, 2))
-    for name, shift in PIVOT_SHIFTS.items():
-        bone, parent = BONE[name], int(PARENTS[BONE[name]])
-        d = np.array(shift) / REFERENCE_STATURE_M
-        along, across = d * (0.0, 0.0, 1.0), d * (1.0, 1.0, 0.0)
-        within_limb = bool(np.allclose(unmoved[bone, :2], 0.0, atol=1e-6))
-        bone_offsets[bone, :, 0] += along if within_limb else d
-        nexts = [child for child in range(N_BONES) if PARENTS[child] == bone]
-        bone_offsets[nexts, :, 0] -= along
-        # Flesh between two pivots follows both of them, by how near they are.
-        for n in np.flatnonzero((carriers == bone) & ~marks_pivot):
-            share = 1.0 - np.clip(heights[n] / unmoved[nexts[0], 2], 0.0, 1.0) if nexts else 1.0
-            point_offsets[n, :, 0] -= along + share * across
-        if within_limb:
-            for n in np.flatnonzero((carriers == parent) & ~marks_pivot):
-                point_offsets[n, :, 0] -= np.clip(heights[n] / unmoved[bone, 2], 0.0, 1.0) * across
-    for name, shift in JOINT_SHIFTS.items():
-        point_offsets[N_SPHERES + JOINT_NAMES.index(name), :, 0] += np.array(shift) / REFERENCE_STATURE_M
 
 
 def _with_modes(lengths: Array) -> Array:
