@@ -17,6 +17,7 @@ from limbloc_ros.core.hull import Hull
 from limbloc_ros.core.limb_pairs import with_limb
 from limbloc_ros.core.pipeline import Carver
 from limbloc_ros.core.pose import JOINT, JOINT_NAMES
+from limbloc_ros.core.priors import SizeMemory
 from limbloc_ros.core.search import ARM
 from limbloc_ros.core.surface import extract_surface
 from limbloc_ros.core.tracker import Tracker
@@ -75,7 +76,7 @@ def test_a_person_keeps_the_size_while_being_followed(monkeypatch):
         return np.std(shapes[1:], axis=0).mean()
 
     remembered = spread()
-    monkeypatch.setattr(Tracker, "SIZE_WEIGHT", 0.0)
+    monkeypatch.setattr(SizeMemory, "REMEMBERED", 1)
     assert remembered < 0.5 * spread()
 
 
@@ -357,8 +358,8 @@ def test_reset_forgets_everything(stand):
     stand.run(follower, 5)
     follower.reset()
     fresh = Tracker(seed=0)
-    assert follower._size.shape == fresh._size.shape == (0,)
-    plain = vars(fresh).keys() - {"_centre", "_size"}
+    assert follower._sizes.frames == fresh._sizes.frames == 0
+    plain = vars(fresh).keys() - {"_centre", "_sizes"}
     assert {name: getattr(follower, name) for name in plain} == {name: getattr(fresh, name) for name in plain}
     stand.run(follower, 1)
     assert stand.search_frames == [1, 6]

@@ -31,7 +31,7 @@ NO_MATCH_XOR = 0.62
 #: What lies so far, m, beside a figure is no cloth: an arm that it has elsewhere, or something in its hands.
 BESIDE_M = 0.16
 #: Where nobody knows what the cameras saw, one of this smooth energy (m^2) is none either.
-NO_MATCH_COST = 2.8e-4
+NO_MATCH_COST = 2.1e-4
 #: The chance that some joint of the limbs is 15 cm off from which on a pose is not to be acted on. Its log-odds are
 #: those of a figure without any sign of that, and what is added for each sign (`risk_of`):
 #: - the less an arm shows: the logarithms of what only the upper arm and only the forearm explain of the silhouettes
@@ -54,7 +54,7 @@ USUAL_LOG_ARM, USUAL_LOG_SHIN, USUAL_PASSED_M, USUAL_DEPTH_M = -3.36, -0.43, 0.0
 LEAST_SHOWN = 0.003
 #: Error that remains where nothing is in doubt, m; how far the energy's curvature is believed; by how much the energy
 #: of a rival (as a fraction of the least) may be above that before it hardly counts.
-FLOOR_M, BELIEF, RIVAL_WIDTH = 0.010, 0.015, 0.08
+FLOOR_M, BELIEF, RIVAL_WIDTH = 0.008, 0.015, 0.08
 
 
 def joint_sigma(state: FigureState, system: System, rivals: Rivals = ()) -> Array:

@@ -55,7 +55,7 @@ class Weights:
     posture: float = 2e-7
     limits: float = 2e-2
     spine: float = 2e-4
-    proportions: float = 4e-6
+    proportions: float = 2e-6
     clothing: float = 4e-6
 
 

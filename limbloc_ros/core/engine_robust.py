@@ -79,7 +79,7 @@ class Effort:
     points: int = 1000
     iterations: tuple[int, int, int, int, int] = (3, 5, 6, 4, 12)
     lenient_limits: float = 3e-3
-    enough: float = 3.4e-4
+    enough: float = 2.6e-4
     certain: float = 0.0
     likely: float = 0.0
     shown: bool = True
@@ -95,15 +95,14 @@ JUDGED_CLOTHING = 2e-5
 #: figure often has the higher energy (a limb that one mask lost is not in the hull), but hardly ever the higher sum.
 SEEN_WEIGHT = 1e-2
 #: A figure that is as likely wrong as this is searched for once more, and harder; the limbs of one that is less likely
-#: wrong than that are left where they are. (Of 167 figures of an energy below 2.5e-4 and of that little risk none was
-#: wrong, and one had a joint 10 cm off that trying its limbs elsewhere brought back.)
+#: wrong than that are left where they are. (Of 167 figures of low energy, `Effort.likely`, and of that little risk none
+#: was wrong, and one had a joint 10 cm off that trying its limbs elsewhere brought back.)
 WORTH_A_SEARCH, CALM = 0.05, 0.003
-#: One search after the other, until the energy is low and the figure not doubtful: most are found easily. Of 492 frames
-#: the first search ended below 3e-4 in 426; 8 of these were wrong, of which 7 were doubtful, as no right one was (the
-#: frames by which both bounds were chosen).
+#: One search after the other, until the energy is low and the figure not doubtful: most are found easily. Of 271 frames
+#: the first search ended with an energy below `enough` and little doubt in 221; one of these was wrong.
 QUICK = Effort(
     torsos=2, leg_pairs=2, starts=3, survivors=2, arm_repairs=1, strict=2, single_arms=2, single_legs=1, rounds=1,
-    finalists=1, candidates=32, enough=3e-4, certain=1.6e-4, likely=2.5e-4, shown=False,
+    finalists=1, candidates=32, enough=2.25e-4, certain=1.2e-4, likely=1.9e-4, shown=False,
 )  # fmt: skip
 HARDER = Effort(
     torsos=14, torso_search=search.TorsoSearch(headings=12, listed=3000, compared=200, climbed=60, steps=480),
@@ -190,7 +189,7 @@ def refine(
 
     def with_priors(system: lm.System, s: FigureState) -> lm.System:
         for prior in priors:
-            system = prior.added_to(system, s)
+            system = system + prior.system(s)
         return system
 
     return lm.minimise(

@@ -30,7 +30,7 @@ from limbloc_ros.core.engine_robust import (
 )
 from limbloc_ros.core.figure import BONE, FigureState
 from limbloc_ros.core.hull import Hull
-from limbloc_ros.core.priors import Inertia, KnownSize
+from limbloc_ros.core.priors import Inertia, KnownSize, SizeMemory
 from limbloc_ros.core.search import ARM, LEG, LimbKind, Medial
 from limbloc_ros.core.surface import Surface
 
@@ -49,7 +49,7 @@ class Tracker:
     """Fits frame after frame, each from the last; starts anew when there is no last one or the fit went wrong."""
 
     #: A cost this much above the usual one, or above this many m^2, is no longer believed ...
-    DOUBT, DOUBTFUL_COST = 1.35, 4.5e-4
+    DOUBT, DOUBTFUL_COST = 1.35, 3.4e-4
     #: ... but starting anew, which takes as long as many followed frames, is tried only every so many frames: in a
     #: live room a slow fit makes the next step longer. Each time that starting anew finds nothing better, the wait
     #: doubles, up to this: some hulls are just bad. Only after a hopeless start the next frame is tried.
@@ -72,8 +72,9 @@ class Tracker:
         HARDER,
     )  # fmt: skip
     #: Every so many frames one of the limbs has its turn to be looked for elsewhere, in so many places, and in so many
-    #: when all are; by how much of the energy it and what the silhouettes add must be lower there.
-    TURN, PLACES, HASTY_PLACES, LIMB_GAIN = 2, 1, 2, 0.03
+    #: when all are; by how much of the energy it and what the silhouettes add must be lower there, for each 5 cm that a
+    #: joint jumps: ragged hulls tell little, and what jumps is mostly wrong.
+    TURN, PLACES, HASTY_PLACES, LIMB_GAIN, JUMP_M = 2, 1, 2, 0.03, 0.05
     #: When the cost is so much above the usual one, the figure is first carried on by so many steps, and then all limbs
     #: are checked at once; each time in vain, the wait doubles, up to this, unless the cost rises as much once more.
     #: Then a limb that settles where it was counts as well: it may have come back along a better way.
@@ -83,9 +84,6 @@ class Tracker:
     #: and 4, or 8 and 4, a wrist is 10 to 18 cm off in 4 and 8 of 1320 frames, with these in none; with limbs checked
     #: in every third frame wrists of raised arms stay as far behind in rough hulls.)
     STEPS, FAR_STEPS, FINAL_STEPS = 8, 20, 6
-    #: People do not change their size, and one hull says little of it: what a deviation of one standard deviation from
-    #: the mean shape so far costs (m^2) per frame in that mean, and how many frames count.
-    SIZE_WEIGHT, REMEMBERED = 2e-5, 20
     #: Joints go on moving by this share of their last step; what it costs in the final refinement that they do not, and
     #: from which distance on that says that they move otherwise. (All of the step would be less jitter still, but
     #: carries limbs beyond their places when they stop; three times the weight leaves turning people behind.)
@@ -109,7 +107,7 @@ class Tracker:
         self._last_scratch = -self.PATIENCE
         self._wait, self._vain, self._last_cut = self.PATIENCE, False, False
         self._centre = np.zeros(3)
-        self._size, self._sized = np.zeros(0), 0
+        self._sizes = SizeMemory.nothing()
 
     def follow(self, hull: Hull, surface: Surface, risk_of: RiskOf | None = None) -> Fit | None:
         """Fit the next frame.
@@ -132,7 +130,7 @@ class Tracker:
             guesses = self._guesses(self._last, moved)
             systems = [energy.system(guess, evidence, self._firm) for guess in guesses]
             best = min(range(len(guesses)), key=lambda n: systems[n].cost)
-            size = KnownSize(self._size, self.SIZE_WEIGHT * min(self._sized, self.REMEMBERED))
+            size = self._sizes.known(self._weights.proportions)
             steps = self.STEPS if np.abs(moved).max() < 0.1 else self.FAR_STEPS
             result = refine(guesses[best], evidence, self._firm, steps, (size,), systems[best])
             if not cut:
@@ -140,7 +138,8 @@ class Tracker:
             judged = result.system.cost - size.cost(result.state.shape)
             inertia = Inertia(self._expected_joints(self._last, moved), self.INERTIA, self.INERTIA_WIDTH_M)
             final = refine(result.state, evidence, self._weights, self.FINAL_STEPS, (size, inertia))
-            self._remember(final.state.shape)
+            terms = size.system(final.state) + inertia.system(final.state)
+            self._sizes = self._sizes.with_frame(final.state, final.system - terms)
             fit = Fit(final.state, final.system, judged=judged)
         if fit is None or self._doubts(fit.judged, cut):
             self._last_scratch, self._last_cut = self._frame, cut
@@ -158,7 +157,7 @@ class Tracker:
             if scratch is not None and not self._vain:
                 fit, self._wait = scratch, self.PATIENCE if cut or scratch.judged < self.DOUBTFUL_COST else 1
                 before = None  # how the figure has turned until now was wrong
-                self._size, self._sized = scratch.state.shape, 1
+                self._sizes = SizeMemory.nothing().with_frame(scratch.state, scratch.system)
             else:
                 self._wait = min(2 * self._wait, self.LONGEST_WAIT)
         if fit is None:
@@ -187,11 +186,6 @@ class Tracker:
         if self._before is None:
             return joints + moved
         return joints + self.PACE * (joints - figure.place(self._before).joints)
-
-    def _remember(self, shape: Array) -> None:
-        """The mean shape of the last frames."""
-        self._sized = min(self._sized + 1, 2 * self.REMEMBERED)
-        self._size = self._size + (shape - self._size) / self._sized
 
     def _doubts(self, cost: float, cut: bool) -> bool:
         whole_now = self._last_cut and not cut
@@ -248,7 +242,8 @@ class Tracker:
                 other = refine(settled, evidence, self._firm, 8, (size,))
                 gain = result.system.cost - other.system.cost
                 gain += unseen(result.state, hull) - unseen(other.state, hull)
-                if gain > self.LIMB_GAIN * result.system.cost:
+                jumps = max(1.0, apart_m(other.state, result.state) / self.JUMP_M)
+                if gain > self.LIMB_GAIN * jumps * result.system.cost:
                     result = other
         return result
 
