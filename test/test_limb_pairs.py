@@ -371,13 +371,16 @@ def test_the_true_pair_wins(person, kind):
         ends = [np.linalg.norm(limb.found[m, 3:6] - limb.found[n, 3:6])
                 for limb, m, n in zip(limbs, (a, b), (i, j), strict=True)]  # fmt: skip
         assert max(ends) >= limb_pairs.APART_M
-    # the truth beats all that the search found, whatever its own score was
+    # the truth, or what lies next to it, beats all that the search found, whatever its own score was; next to it, because
+    # how the hand is turned is only guessed
     whole = [
         dataclasses.replace(limb, found=np.concatenate([limb.found, [[*true, 99.0]]]))
         for limb, true in zip(limbs, truth, strict=True)
     ]
     a, b, cost = limb_pairs.limb_pairs(person.placed, *whole, kind, body, evidence, Weights(), 1)[0]
-    assert (a, b) == (len(limbs[0].found), len(limbs[1].found))
+    assert len(limbs[0].found) == a or len(limbs[1].found) == b
+    for limb, row, true in zip(whole, (a, b), truth, strict=True):
+        assert np.abs(limb.found[row, :6] - true).max() < 0.04
     assert cost < pairs[0][2]
 
 

