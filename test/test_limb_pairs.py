@@ -371,7 +371,7 @@ def test_the_true_pair_wins(person, kind):
         ends = [np.linalg.norm(limb.found[m, 3:6] - limb.found[n, 3:6])
                 for limb, m, n in zip(limbs, (a, b), (i, j), strict=True)]  # fmt: skip
         assert max(ends) >= limb_pairs.APART_M
-    # the truth, or what lies next to it, beats all that the search found, whatever its own score was; next to it, because
+    # the truth, or what lies next to it, beats all that the search found, whatever its own score was; next to it, as
     # how the hand is turned is only guessed
     whole = [
         dataclasses.replace(limb, found=np.concatenate([limb.found, [[*true, 99.0]]]))
