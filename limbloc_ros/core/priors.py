@@ -73,7 +73,7 @@ class SizeMemory:
     than one. In many postures these differences cancel, and then the frames have more to say.
 
     Attributes:
-        frames: how many are in the mean, at most `REMEMBERED`; later ones push earlier ones out.
+        frames: how many are in the mean, as far as they count: older ones fade.
         information: [1 + K, 1 + K] the mean of their matrices, m^2.
         pull: [1 + K] the mean of information @ likeliest shape, m^2.
         pointing: two [4, 3], the mean of the directions of arms and legs, in the pelvis's axes.
@@ -84,10 +84,14 @@ class SizeMemory:
     pull: Array
     pointing: tuple[Array, Array]
 
-    #: So many frames count.
+    #: As many frames count at most.
     REMEMBERED = 20
     #: How many more postures frames count as when the directions of arms and legs vary by all that they can.
     POSTURES = 20.0
+    #: The frames before were of another size, or of a wrong figure, when holding on to it costs this share of a frame's
+    #: energy: of a size that fits it is 0.5 to 3.4 %. (A quadratic is that of the energy only near its least: from far
+    #: off each frame would move the size a little, and all that were remembered hold it back.)
+    CONTRADICTED = 0.10
 
     @staticmethod
     def nothing() -> SizeMemory:
@@ -97,9 +101,12 @@ class SizeMemory:
 
     def with_frame(self, state: FigureState, system: System) -> SizeMemory:
         """After one more frame: its figure, and the energy's system there."""
-        frames = min(self.frames + 1, self.REMEMBERED)
-        kept, new = 1.0 - 1.0 / frames, 1.0 / frames
         information, pull = _of_the_shape(state.shape, system)
+        if not (np.isfinite(information).all() and np.isfinite(pull).all()):
+            return self  # a mean would never get rid of it
+        frames = min(self.frames + 1, self.REMEMBERED)
+        new = 2.0 / (frames + 1)  # a mean that fades, of as much as so many frames with equal weights
+        kept = 1.0 - new
         world = figure.place(state).rotations
         directions = (world[bones, :, 2] @ world[0] for bones in _POINTERS)
         arms, legs = (kept * mean + new * now for mean, now in zip(self.pointing, directions, strict=True))
@@ -116,7 +123,7 @@ class SizeMemory:
         """What is known after the remembered frames, in whose energies `Weights.proportions` was this."""
         once = proportions * _per_person()
         surplus = 1.0 - 1.0 / self.postures
-        information = self.information - surplus * np.diag(once)
+        information = self.information - surplus * np.diag(once) + 1e-12 * np.eye(len(once))
         pull = self.pull - surplus * once * _mean_shape()
         return KnownSize(np.asarray(np.linalg.solve(information, pull), np.float64), self.frames * information)
 
@@ -133,7 +140,7 @@ def _of_the_shape(shape: Array, system: System) -> tuple[Array, Array]:
 
 @cache
 def _per_person() -> Array:
-    """[1 + K] one over the variance of each component of a shape between people, as in the energy; clothes are free."""
+    """[1 + K] one over the variance of each component of a shape between people, as in the energy; of clothes 0."""
     table = figure.proportions()
     scale = np.ones(table.n_shape)  # modes are counted in standard deviations
     scale[0] = table.log_stature_std**-2

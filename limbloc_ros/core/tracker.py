@@ -56,8 +56,8 @@ class Tracker:
     PATIENCE, LONGEST_WAIT = 8, 32
     #: By how much of the followed figure's energy the one found anew must be better, or it does not replace it: where
     #: several figures explain a ragged hull nearly equally well, each search ends with another one. (Turned figures and
-    #: figures with exchanged limbs are replaced in the frame in which they are searched for, with twice this as well.)
-    BETTER = 0.15
+    #: figures with exchanged limbs are replaced in the frame in which they are searched for, with half of this as well.)
+    BETTER = 0.3
     #: A hull that the walls of the carve volume cut by so much, m^2 (an arm is a hundredth), is half a person in the
     #: doorway: not worth more than a quick search, until it is whole.
     HALF_M2 = 0.10
@@ -72,8 +72,8 @@ class Tracker:
         HARDER,
     )  # fmt: skip
     #: Every so many frames one of the limbs has its turn to be looked for elsewhere, in so many places, and in so many
-    #: when all are; by how much of the energy it and what the silhouettes add must be lower there, for each 5 cm that a
-    #: joint jumps: ragged hulls tell little, and what jumps is mostly wrong.
+    #: when all are; by how much of the energy it and what the silhouettes add must be lower there, and as much again for
+    #: each 5 cm beyond the first that a joint jumps: ragged hulls tell little, and what jumps is mostly wrong.
     TURN, PLACES, HASTY_PLACES, LIMB_GAIN, JUMP_M = 2, 1, 2, 0.03, 0.05
     #: When the cost is so much above the usual one, the figure is first carried on by so many steps, and then all limbs
     #: are checked at once; each time in vain, the wait doubles, up to this, unless the cost rises as much once more.
@@ -138,8 +138,10 @@ class Tracker:
             judged = result.system.cost - size.cost(result.state.shape)
             inertia = Inertia(self._expected_joints(self._last, moved), self.INERTIA, self.INERTIA_WIDTH_M)
             final = refine(result.state, evidence, self._weights, self.FINAL_STEPS, (size, inertia))
-            terms = size.system(final.state) + inertia.system(final.state)
-            self._sizes = self._sizes.with_frame(final.state, final.system - terms)
+            alone = final.system - size.system(final.state) - inertia.system(final.state)
+            contradicted = size.cost(final.state.shape) > SizeMemory.CONTRADICTED * alone.cost
+            sizes = SizeMemory.nothing() if contradicted else self._sizes
+            self._sizes = sizes.with_frame(final.state, alone)
             fit = Fit(final.state, final.system, judged=judged)
         if fit is None or self._doubts(fit.judged, cut):
             self._last_scratch, self._last_cut = self._frame, cut
@@ -199,7 +201,8 @@ class Tracker:
         bearable = min(self.LIMB_DOUBT * self._usual_cost, self.DOUBTFUL_COST)
         if self._frame < self._next_doubt:
             bearable = max(bearable, self.LIMB_DOUBT * self._vain_cost)
-        hasty = result.system.cost > bearable
+        cost = result.system.cost - size.cost(result.state.shape)
+        hasty = cost > bearable
         if hasty:
             if result.stop == "iterations":
                 result = refine(result.state, evidence, self._firm, self.MORE_STEPS, (size,))
@@ -215,7 +218,7 @@ class Tracker:
         if checked is not result:
             self._doubt_wait, self._next_doubt = 1, self._frame + 1
         elif hasty:
-            self._vain_cost, self._doubt_wait = result.system.cost, min(2 * self._doubt_wait, self.LONGEST_DOUBT)
+            self._vain_cost, self._doubt_wait = cost, min(2 * self._doubt_wait, self.LONGEST_DOUBT)
             self._next_doubt = self._frame + self._doubt_wait
         return checked
 
