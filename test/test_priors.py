@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What earlier frames say of the next: derivatives, sizes in standard deviations, joints that go on moving."""
+"""What earlier frames say of the next: derivatives, sizes that all frames agree on, joints that go on moving."""
 
 from functools import cache
 from pathlib import Path
@@ -128,9 +128,11 @@ def test_frames_that_disagree_are_weighed_by_how_well_they_show_each_size():
     off[SIZE.start] = -1.0
     first = System(0.0, np.zeros(N), np.eye(N))  # least at the shape that it has
     second = System(9.0, diagonal @ off, diagonal)  # one larger by 1 in the first number, nine times as sure
-    known = memory_of((state, first), (state, second)).known(0.0)
-    np.testing.assert_allclose(known.shape - state.shape, np.r_[0.9, np.zeros(n - 1)], atol=1e-6)
-    np.testing.assert_allclose(known.information, np.diag(np.r_[10.0, np.full(n - 1, 2.0)]), atol=1e-6)
+    # of two frames the later one counts twice
+    memory = memory_of((state, first), (state, second))
+    known = memory.known(0.0)
+    np.testing.assert_allclose(known.shape - state.shape, np.r_[18 / 19, np.zeros(n - 1)], atol=1e-6)
+    np.testing.assert_allclose(known.information, 2 * np.diag(np.r_[19 / 3, np.ones(n - 1)]), atol=1e-6)
 
 
 def test_old_frames_are_forgotten():
@@ -142,6 +144,12 @@ def test_old_frames_are_forgotten():
     assert memory.frames == SizeMemory.REMEMBERED
     assert np.all(memory.known(0.0).shape - state.shape > 0.95)
     assert np.linalg.eigvalsh(memory.known(0.0).information).max() == pytest.approx(SizeMemory.REMEMBERED)
+
+
+def test_a_frame_that_is_no_number_is_not_remembered():
+    state = figure_poses.random_state(np.random.default_rng(8))
+    memory = memory_of((state, System(0.0, np.zeros(N), np.eye(N))))
+    assert memory.with_frame(state, System(0.0, np.full(N, np.nan), np.eye(N))) is memory
 
 
 def test_how_people_differ_counts_once_for_all_postures():
@@ -156,11 +164,17 @@ def test_how_people_differ_counts_once_for_all_postures():
     assert mean.shape[0] == pytest.approx(figure.proportions().log_stature_mean)
     np.testing.assert_allclose(mean.shape[1:], 0.0, atol=1e-6)
     moving = [figure_poses.random_state(rng) for _ in range(12)]
-    many = memory_of(*[(s, nothing_seen) for s in moving])
+    many = memory_of(*[(s, system(s, evidence_of_nothing(), weights)) for s in moving])
     assert many.postures > 3.0
-    modes = slice(1, figure.proportions().clothing_from)
-    in_one, in_many = (np.diag(m.known(weights.proportions).information)[modes] / m.frames for m in (one, many))
-    np.testing.assert_allclose(in_many * many.postures, in_one, rtol=1e-3)
+    body = figure.proportions().clothing_from
+    in_one, in_many = (np.diag(m.known(weights.proportions).information) / m.frames for m in (one, many))
+    variance = np.r_[figure.proportions().log_stature_std ** 2, np.ones(body - 1)]
+    np.testing.assert_allclose(in_one[:body] * variance, weights.proportions, rtol=1e-3)
+    np.testing.assert_allclose(in_many[:body] * many.postures, in_one[:body], rtol=1e-3)
+    np.testing.assert_allclose(in_many[body:], in_one[body:], rtol=1e-9)  # clothes are no proportions
+    likeliest = many.known(weights.proportions).shape
+    assert likeliest[0] == pytest.approx(figure.proportions().log_stature_mean)
+    np.testing.assert_allclose(likeliest[1:body], 0.0, atol=1e-5)
     arms_only = []
     for s in moving:
         rotations = s.rotations.copy()

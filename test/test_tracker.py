@@ -81,6 +81,44 @@ def test_a_person_keeps_the_size_while_being_followed(monkeypatch):
     assert remembered < 0.7 * spread()  # at first it learns, too
 
 
+def test_a_wrong_size_is_given_up():
+    follower = Tracker(seed=0)
+    true = follow(follower, 20)
+    small = replace(true.state, shape=true.state.shape - np.eye(len(true.state.shape))[0] * 0.25)
+    follower._last = small
+    follower._sizes = SizeMemory.nothing().with_frame(small, true.system)
+    statures = [np.exp(follow(follower, frame).state.shape[0]) for frame in range(21, 33)]
+    assert statures[-1] == pytest.approx(np.exp(true.state.shape[0]), rel=0.03)
+    assert max(errors(follow(follower, 33), 33)) < 0.1
+
+
+@pytest.mark.parametrize(
+    ("jump_m", "cost", "gain", "believed"),
+    [
+        (0.06, 2e-4, 0.04, True),
+        (0.06, 2e-4, 0.03, False),  # of 3 % and a fifth as much again
+        (0.30, 2e-4, 0.04, False),  # far off: six times as much
+        (0.30, 2e-4, 0.20, True),
+        (0.06, 3 * Tracker.DOUBTFUL_COST, 0.04, False),  # a ragged hull: three times as much
+        (0.06, 3 * Tracker.DOUBTFUL_COST, 0.12, True),
+    ],
+)
+def test_a_limb_must_explain_the_more_the_further_it_jumps_and_the_worse_the_hull_is(
+    monkeypatch, jump_m, cost, gain, believed
+):
+    here = FigureState.standing([0.0, 0.0, 1.0])
+    there = FigureState.standing([jump_m, 0.0, 1.0])
+    monkeypatch.setattr(tracker, "make_scene", lambda *args: SimpleNamespace(quick=None, lenient=None))
+    monkeypatch.setattr(tracker.Medial, "of", lambda hull: None)
+    monkeypatch.setattr(tracker, "with_one_limb", lambda *args: [there])
+    monkeypatch.setattr(tracker, "unseen", lambda state, hull: 0.0)
+    found = SimpleNamespace(state=there, system=costing((1.0 - gain) * cost))
+    monkeypatch.setattr(tracker, "refine", lambda *args: found)
+    followed = SimpleNamespace(state=here, system=costing(cost))
+    checked = Tracker(seed=0)._check_limbs([(ARM, "L")], 1, followed, None, None, None, None, 0.0)
+    assert (checked is found) == believed
+
+
 def test_inertia_steadies_the_joints(monkeypatch):
     frames = range(20, 36)
     truth = np.array([truth_of(frame) for frame in frames])
@@ -315,8 +353,10 @@ def test_a_clearly_better_fit_replaces_the_followed_one(stand):
     follower = Tracker(seed=0)
     stand.run(follower, 8)
     stand.scratch_cost = (0.99 - Tracker.BETTER) * 6e-4
+    assert follower._sizes.frames == 8
     assert stand.run(follower, 1) == [stand.scratch_cost]
     assert stand.search_frames == [1, 9]
+    assert follower._sizes.frames == 1  # the wrong figure's size means nothing
 
 
 def test_a_figure_found_anew_is_not_carried_on_as_the_wrong_one_turned(stand):
@@ -352,7 +392,7 @@ def test_nobody_and_somebody_again(stand):
 
 def test_half_a_person_in_the_doorway_is_searched_quickly_and_again_when_whole(stand):
     stand.cut = set(range(1, 6))
-    stand.scratch_cost = 8e-4  # hopeless
+    stand.scratch_cost = 6.5e-4  # hopeless
     stand.costs = dict.fromkeys(range(1, 20), 10e-4)
     stand.run(Tracker(seed=0), 7)
     assert [(frame, len(searches)) for frame, *_, searches in stand.searched] == [(1, 1), (6, 1), (7, 1)]

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bake many random people of the body model Anny for `fit_flesh.py`; formats in tools/README.md.
+"""Bake many random people of the body model Anny, in the format of the simulated ones, for `fit_flesh.py`.
 
     pip install anny==0.6.2 torch
-    python tools/bake_population.py population.npz --people 260
+    python tools/bake_population.py movable.npz --people 260
 
 Sex, age, muscle, weight, proportions and height are drawn at random, statures are 1.15 m to 2.0 m. Fingers are curled,
 for nobody carries them straight: each person's by another amount. Otherwise this is `bake_person.py`.
@@ -21,7 +21,7 @@ BEND = np.radians([24.0, 22.0, 12.0])
 
 
 def drawn(rng: np.random.Generator) -> dict[str, float]:
-    """A random phenotype; a third of the people each are all male, all female and in between."""
+    """A random phenotype; a fifth of the people each are all male and all female, the others in between."""
     return {
         "gender": float(np.clip(rng.uniform(-0.3, 1.3), 0.0, 1.0)),
         "age": float(rng.uniform(0.34, 1.0)),

@@ -8,7 +8,7 @@ move before random cameras. With their joints held where they truly are the sphe
 and with each of the directions in which people differ, until the energy of all hulls together is as low as it gets.
 Then a fit has no reason to move the joints away from there.
 
-    python tools/fit_flesh.py body.npz population.npz limbloc_ros/core/proportions.npz
+    python tools/fit_flesh.py body.npz movable.npz limbloc_ros/core/proportions.npz
 
 `body.npz` is what `fit_proportions.py` writes. Takes about ten minutes on one core, and 2 GB.
 """
@@ -59,7 +59,7 @@ SHARE[[JOINT["head_top"]] + [JOINT[f"{name}_{side}"] for name in ("hand", "toe",
 SHARE[[JOINT[f"fingertip_{side}"] for side in "LR"]] = 0.0
 #: What it costs (m^2) to change the flesh by one stature, so that spheres which no hull tells about stay.
 RIDGE = 0.002
-#: Most that a number of the flesh changes in a step, statures; steps go 1 / (1 + DAMPING) of the way.
+#: Most that a number of the flesh changes in a step, statures; how much steps are damped (Marquardt).
 LARGEST, DAMPING = 0.004, 0.3
 SMALLEST_RADIUS = 0.006  # statures
 #: By what share of its mean a radius may change along all directions together: it stays positive whoever it is.
@@ -246,26 +246,26 @@ def set_flesh(centres: Array, radii: Array) -> None:
 
 
 def joint_offsets(examples: list[Example], names: list[str], before: Array) -> Array:
-    """[J, 3, 1 + K] where joints are in their bones, those that are no pivots: the mean of where they truly were."""
+    """[J, 3, 1 + K] where joints are in their bones, those that are no pivots: the median of where they truly were."""
     off = []
     for example in examples:
         placed = figure.place(example.state)
         missing = (example.joints - placed.joints)[[JOINT[name] for name in names]]
         frames = placed.rotations[[BONE[JOINT_BONES[name]] for name in names]]
         off.append(np.einsum("jik,ji->jk", frames, missing) / np.exp(example.state.shape[0]))
-    mean = np.median(off, axis=0)
+    typical = np.median(off, axis=0)
     out = before.copy()
     for k, name in enumerate(names):
         if not before[k].any():
             continue
         other = names.index(name[:-1] + {"L": "R", "R": "L"}[name[-1]]) if name[-2:] in ("_L", "_R") else k
-        out[k, :, 0] += 0.5 * (mean[k] + mean[other] * [1.0, -1.0, 1.0])
+        out[k, :, 0] += 0.5 * (typical[k] + typical[other] * [1.0, -1.0, 1.0])
     return out
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    for name in ("body", "population", "output"):
+    for name in ("body", "movable", "output"):
         parser.add_argument(name, type=Path)
     parser.add_argument("--frames", type=int, default=5, help="hulls of each person")
     parser.add_argument("--steps", type=int, default=9)
@@ -280,7 +280,7 @@ def main() -> None:
     ]
 
     examples: list[Example] = []
-    for k, person in enumerate(tqdm(list(people(arguments.population)), desc="people")):
+    for k, person in enumerate(tqdm(list(people(arguments.movable)), desc="people")):
         rng = np.random.default_rng([11, k])
         seen = list(hulls_of(person, CAMERAS[k % len(CAMERAS)], arguments.frames, rng))
         if seen:

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Make `limbloc_ros/core/proportions.npz`: the standard human proportions that the figure starts from.
+"""Make `body.npz`: the standard human proportions, from skins; `fit_flesh.py` makes the figure's flesh of it.
 
 The paper asks for "the standard human body proportions" (section 2.2, constraint 1). They are taken from a
 population of 400 bodies of the parametric body model Anny (CC0 data), children of 1.1 m to adults of 2.0 m, thin to
 heavy: the mean of every length and radius, and the ten directions in which people differ most. Needs torch (CPU is
 enough, a few minutes) and two files made with `anny` (formats in tools/README.md):
 
-    python tools/fit_proportions.py population.npz posed.npz limbloc_ros/core/proportions.npz
+    python tools/fit_proportions.py population.npz posed.npz body.npz
 """
 
 from __future__ import annotations

@@ -95,7 +95,7 @@ JUDGED_CLOTHING = 2e-5
 #: figure often has the higher energy (a limb that one mask lost is not in the hull), but hardly ever the higher sum.
 SEEN_WEIGHT = 1e-2
 #: A figure that is as likely wrong as this is searched for once more, and harder; the limbs of one that is less likely
-#: wrong than that are left where they are. (Of 167 figures of low energy, `Effort.likely`, and of that little risk none
+#: wrong than that are left where they are. (Of 167 figures of an energy below `Effort.likely` and that little risk none
 #: was wrong, and one had a joint 10 cm off that trying its limbs elsewhere brought back.)
 WORTH_A_SEARCH, CALM = 0.05, 0.003
 #: One search after the other, until the energy is low and the figure not doubtful: most are found easily. Of 271 frames

@@ -55,8 +55,7 @@ class Tracker:
     #: doubles, up to this: some hulls are just bad. Only after a hopeless start the next frame is tried.
     PATIENCE, LONGEST_WAIT = 8, 32
     #: By how much of the followed figure's energy the one found anew must be better, or it does not replace it: where
-    #: several figures explain a ragged hull nearly equally well, each search ends with another one. (Turned figures and
-    #: figures with exchanged limbs are replaced in the frame in which they are searched for, with half of this as well.)
+    #: several figures explain a ragged hull nearly equally well, each search ends with another one.
     BETTER = 0.3
     #: A hull that the walls of the carve volume cut by so much, m^2 (an arm is a hundredth), is half a person in the
     #: doorway: not worth more than a quick search, until it is whole.
@@ -72,8 +71,9 @@ class Tracker:
         HARDER,
     )  # fmt: skip
     #: Every so many frames one of the limbs has its turn to be looked for elsewhere, in so many places, and in so many
-    #: when all are; by how much of the energy it and what the silhouettes add must be lower there, and as much again for
-    #: each 5 cm beyond the first that a joint jumps: ragged hulls tell little, and what jumps is mostly wrong.
+    #: when all are; by how much of the energy it and what the silhouettes add must be lower there. As much again is
+    #: asked for each 5 cm beyond the first that a joint jumps, and all of it as many times as the energy is a doubtful
+    #: one: ragged hulls tell little, and what jumps there is mostly wrong.
     TURN, PLACES, HASTY_PLACES, LIMB_GAIN, JUMP_M = 2, 1, 2, 0.03, 0.05
     #: When the cost is so much above the usual one, the figure is first carried on by so many steps, and then all limbs
     #: are checked at once; each time in vain, the wait doubles, up to this, unless the cost rises as much once more.
@@ -246,7 +246,8 @@ class Tracker:
                 gain = result.system.cost - other.system.cost
                 gain += unseen(result.state, hull) - unseen(other.state, hull)
                 jumps = max(1.0, apart_m(other.state, result.state) / self.JUMP_M)
-                if gain > self.LIMB_GAIN * jumps * result.system.cost:
+                ragged = max(1.0, result.system.cost / self.DOUBTFUL_COST)
+                if gain > self.LIMB_GAIN * jumps * ragged * result.system.cost:
                     result = other
         return result
 
