@@ -76,8 +76,8 @@ def lens_range(camera: Camera) -> tuple[float, float]:
 def distort(camera: Camera, normalised: NDArray[np.float64]) -> NDArray[np.float64]:
     """Distorted normalised coordinates [..., 2] of normalised coordinates [..., 2].
 
-    OpenCV's models except for a tilted sensor, in a tenth of its time: nothing is carved before the lenses of all cameras
-    are measured. As in OpenCV, a fisheye leaves the points of its axis where they are.
+    OpenCV's models except for a tilted sensor, in a tenth of its time: nothing is carved before the lenses of all
+    cameras are measured. As in OpenCV, a fisheye leaves the points of its axis where they are.
     """
     a, b = normalised[..., 0], normalised[..., 1]
     k = np.zeros(14)
