@@ -49,7 +49,7 @@ class Tracker:
     """Fits frame after frame, each from the last; starts anew when there is no last one or the fit went wrong."""
 
     #: A cost this much above the usual one, or above this many m^2, is no longer believed ...
-    DOUBT, DOUBTFUL_COST = 1.35, 3.4e-4
+    DOUBT, DOUBTFUL_COST = 1.35, 4.5e-4
     #: ... but starting anew, which takes as long as many followed frames, is tried only every so many frames: in a
     #: live room a slow fit makes the next step longer. Each time that starting anew finds nothing better, the wait
     #: doubles, up to this: some hulls are just bad. Only after a hopeless start the next frame is tried.
