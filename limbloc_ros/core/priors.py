@@ -120,12 +120,16 @@ class SizeMemory:
         return 1.0 + self.POSTURES * min(1.0 - float((mean**2).sum(axis=1).mean()) for mean in self.pointing)
 
     def known(self, proportions: float) -> KnownSize:
-        """What is known after the remembered frames, in whose energies `Weights.proportions` was this."""
+        """What is known after the remembered frames, in whose energies `Weights.proportions` was this.
+
+        One frame's figure may be a wrong one: its size is believed when the next one has agreed.
+        """
         once = proportions * _per_person()
         surplus = 1.0 - 1.0 / self.postures
         information = self.information - surplus * np.diag(once) + 1e-12 * np.eye(len(once))
         pull = self.pull - surplus * once * _mean_shape()
-        return KnownSize(np.asarray(np.linalg.solve(information, pull), np.float64), self.frames * information)
+        shape = np.asarray(np.linalg.solve(information, pull), np.float64)
+        return KnownSize(shape, (self.frames - 1) * information)
 
 
 def _of_the_shape(shape: Array, system: System) -> tuple[Array, Array]:
