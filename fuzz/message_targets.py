@@ -110,7 +110,7 @@ def _cloud_seeds() -> list[bytes]:
     sdf = ((np.sqrt(x * x + y * y + z * z) - 2.5) * 0.02).astype(np.float32)
     cloud = hull_to_cloud(Hull(0.02, (0, 0, 0), np.minimum(sdf, np.float32(0.06)), 0.06), Header())
     points = bytes(cloud.data)
-    return [bytes(8) + points[: 48 * 150], b"\1" * 8 + points[: 48 * 20], bytes(8), bytes(8) + _cloud_with_views()]
+    return [bytes(8) + points[: 24 * 150], b"\1" * 8 + points[: 24 * 20], bytes(8), bytes(8) + _cloud_with_views()]
 
 
 def _cloud_with_views() -> bytes:
@@ -138,14 +138,14 @@ def hull_cloud(data: bytes) -> None:
 
     draw = Draw(data[:64] if data[:1] == b"\1" else data[:8])
     points = data[64 if data[:1] == b"\1" else 8 :]
-    msg = PointCloud2(height=1, width=len(points) // 48, point_step=48, fields=list(_HULL_FIELDS))
+    msg = PointCloud2(height=1, width=len(points) // 24, point_step=24, fields=list(_HULL_FIELDS))
     if data[:1] == b"\1":
         draw.take(1)
         msg.width, msg.height, msg.point_step = draw.integer(), draw.integer(), draw.integer()
         msg.fields = msg.fields[: draw.below(16)]
         msg.is_bigendian = bool(draw.below(2))
     else:
-        points = points[: 48 * msg.width]
+        points = points[: 24 * msg.width]
     msg.data.frombytes(points)
     hull = cloud_to_hull(msg)
     if hull is None:

@@ -6,6 +6,7 @@ from __future__ import annotations
 import dataclasses
 import struct
 from array import array
+from typing import Any
 
 import numpy as np
 import pytest
@@ -39,26 +40,31 @@ def ball(voxel_m: float = 0.02, radius_m: float = 0.3, centre: tuple[float, floa
 
 
 def test_bytes_of_one_voxel() -> None:
+    """Four rows of it: so many words take the sizes of the hull."""
     indices, sdf = np.array([[10, -3, 50]], np.int32), np.array([-0.25], np.float32)
     msg = hull_to_cloud(Hull.from_shell(0.02, 0.06, indices, sdf), HEADER)
-    voxel = (0.21, -0.05, 1.01, -0.25, 10, -3, 50)
-    assert bytes(msg.data) == struct.pack("<ffffhhhHIIfffI", *voxel, NOBODY, 20_000, 60_000, 0, 0, 0, 0)
-    assert (msg.width, msg.height, msg.point_step, msg.row_step, msg.is_bigendian) == (1, 1, 48, 48, False)
-    assert [(f.name, f.offset) for f in msg.fields][:4] == [("x", 0), ("y", 4), ("z", 8), ("sdf", 12)]
-    assert [f.datatype for f in msg.fields] == [PointField.FLOAT32] * 4 + [PointField.INT16] * 3 + [
-        PointField.UINT16
-    ] + [PointField.UINT32] * 2 + [PointField.FLOAT32] * 3 + [PointField.UINT32]
+    voxel = (0.21, -0.05, 1.01, -0.25)
+    rows = [struct.pack("<ffffHHI", *voxel, NOBODY, 0, extra) for extra in (20_000, 60_000, 0, 0)]
+    assert bytes(msg.data) == b"".join(rows)
+    assert (msg.width, msg.height, msg.point_step, msg.row_step, msg.is_bigendian) == (4, 1, 24, 96, False)
+    assert [(f.name, f.offset) for f in msg.fields] == [
+        ("x", 0), ("y", 4), ("z", 8), ("sdf", 12), ("camera", 16), ("extra", 20)
+    ]  # fmt: skip
+    assert [f.datatype for f in msg.fields] == [PointField.FLOAT32] * 4 + [PointField.UINT16, PointField.UINT32]
     assert (messages.stamp_ns(msg.header), msg.header.frame_id) == (1_700_000_000_123_456_789, "room")
 
     cut_by, viewpoints = np.array([1], np.uint8), np.array([[0, 0, 0], [2, -1, 1.5]], np.float32)
     hull = Hull.from_shell(0.02, 0.06, indices, sdf, cut_by=cut_by, viewpoints=viewpoints)
     cut = hull_to_cloud(hull, HEADER)
-    assert bytes(cut.data) == struct.pack("<ffffhhhHIIfffI", *voxel, 1, 20_000, 60_000, 2, -1, 1.5, 0)
+    rows = [struct.pack("<ffffHHI", *voxel, 1, 0, extra) for extra in (20_000, 60_000, 2, 0, 0, 0, 0)]
+    rows += [struct.pack("<ffffHHf", *voxel, 1, 0, place) for place in (2.0, -1.0, 1.5)]
+    assert bytes(cut.data) == b"".join(rows)
     back = cloud_to_hull(cut)
     assert back is not None
     assert back.cut_by is not None
     assert back.cut_by.tobytes() == hull.cut_by.tobytes()
-    np.testing.assert_array_equal(back.viewpoints[1], viewpoints[1])
+    assert back.sdf.tobytes() == hull.sdf.tobytes()
+    assert back.viewpoints.tobytes() == viewpoints.tobytes()
 
 
 @pytest.mark.parametrize("voxel_m", [0.02, 0.1, 0.005, 0.0123])
@@ -84,8 +90,7 @@ def test_who_cut_the_hull_comes_back_bit_for_bit() -> None:
     assert back.sdf.tobytes() == hull.sdf.tobytes()
     assert (back.cut_by.dtype, back.viewpoints.dtype) == (np.uint8, np.float32)
     assert back.cut_by.tobytes() == hull.cut_by.tobytes()
-    for camera in (0, 1, 3, 4):
-        assert back.viewpoints[camera].tobytes() == viewpoints[camera].tobytes()
+    assert back.viewpoints.tobytes() == viewpoints.tobytes()
 
 
 def test_outline_rays_are_the_same_live_as_offline() -> None:
@@ -133,12 +138,24 @@ def test_what_the_cameras_saw_travels_along_bit_for_bit() -> None:
     assert back.views.packed == hull.views.packed
 
 
-def test_where_nobody_cut_no_place_is_asked_for() -> None:
-    """Bytes of a place are read only where a camera is named."""
-    msg = overwritten(32, struct.pack("<fff", float("nan"), 1.0, 2.0))
-    back = cloud_to_hull(msg)
+def test_of_a_small_hull_travels_everything_too() -> None:
+    """What belongs to the hull as a whole takes more words than it has voxels."""
+    rig = ring(4)
+    views = carve(ball_masks(rig, [((0.0, 0.0, 1.0), 0.4)]), rig, HullConfig()).views
+    assert views is not None
+    indices, sdf = np.array([[0, 0, 5], [0, 1, 5]], np.int32), np.array([-0.02, 0.01], np.float32)
+    hull = dataclasses.replace(Hull.from_shell(0.02, 0.06, indices, sdf), views=views)
+    back = cloud_to_hull(hull_to_cloud(hull, HEADER))
+    assert back is not None and back.views is not None
+    assert (back.sdf.tobytes(), back.views.packed) == (hull.sdf.tobytes(), views.packed)
+
+
+@pytest.mark.parametrize("index", [(-32768, 32767, 0), (32767, -32768, 32767)])
+def test_voxels_far_from_the_origin_are_told_apart(index: tuple[int, int, int]) -> None:
+    hull = Hull.from_shell(0.0123, 0.06, np.array([index], np.int32), np.array([-0.01], np.float32))
+    back = cloud_to_hull(hull_to_cloud(hull, HEADER))
     assert back is not None
-    assert back.cut_by is None
+    assert back.index_min == hull.index_min
 
 
 def test_an_empty_cloud_is_nobody() -> None:
@@ -152,10 +169,12 @@ def damaged(**changes: object) -> PointCloud2:
     return msg
 
 
-def overwritten(offset: int, value: bytes) -> PointCloud2:
+def overwritten(*changes: Any) -> PointCloud2:
+    """With other bytes from some offset on, and from another."""
     msg = damaged()
     data = bytearray(msg.data)
-    data[offset : offset + len(value)] = value
+    for offset, value in zip(changes[::2], changes[1::2], strict=True):
+        data[offset : offset + len(value)] = value
     msg.data = array("B", data)
     return msg
 
@@ -163,22 +182,28 @@ def overwritten(offset: int, value: bytes) -> PointCloud2:
 @pytest.mark.parametrize(
     ("msg", "words"),
     [
-        (damaged(width=1_000_000_000), "1000000000x1 points needs 48000000000 bytes"),
+        (damaged(width=1_000_000_000), "1000000000x1 points needs 24000000000 bytes"),
         (damaged(data=array("B", bytes(100))), "got 100"),
-        (damaged(point_step=16), "48 bytes per point"),
+        (damaged(width=3, data=array("B", bytes(72))), "4 points or more, got 3"),
+        (damaged(point_step=16), "24 bytes per point"),
         (damaged(is_bigendian=True), "little-endian"),
         (damaged(fields=[PointField(name="rgb")]), "got rgb"),
+        (overwritten(0, struct.pack("<f", 0.02)), "centres of voxels of 0.1 m"),
+        (overwritten(4, struct.pack("<f", float("nan"))), "centres of voxels"),
+        (overwritten(8, struct.pack("<f", 3276.85)), "not too far away"),
         (overwritten(12, struct.pack("<f", float("nan"))), "finite"),
         (overwritten(12, struct.pack("<f", 7.0)), "below the band"),
-        (overwritten(24, struct.pack("<I", 5)), "one voxel size"),
-        (overwritten(16, struct.pack("<hhh", 32_000, -32_000, 32_000)), "too large"),
-        (overwritten(22, struct.pack("<H", 256)), r"up to 255 \(nobody\), got 256"),
-        (overwritten(22, struct.pack("<H", 65_535)), "got 65535"),
-        (overwritten(22, struct.pack("<HIIf", 3, 100_000, 60_000, float("nan"))), "vp_x, vp_y, vp_z.*finite"),
-        (overwritten(44, struct.pack("<I", 4_000_000_000)), "cannot hold views of 4000000000 bytes"),
-        (overwritten(44, struct.pack("<I", 5)), "8 bytes or more"),
-        (overwritten(44, struct.pack("<I", 40)), "1 to 255 cameras .* got 0 and 0"),
-        (overwritten(22, struct.pack("<HIIfff", 0, 100_000, 60_000, 1.0, 2.0, float("-inf"))), "finite"),
+        (overwritten(0, struct.pack("<fff", 3200.05, -3200.05, 3200.05)), "too large"),
+        (overwritten(16, struct.pack("<H", 256)), r"up to 255 \(nobody\), got 256"),
+        (overwritten(16, struct.pack("<H", 65_535)), "got 65535"),
+        (overwritten(20, struct.pack("<I", 0)), "above 0; got 0 um and 60000 um"),
+        (overwritten(44, struct.pack("<I", 0)), "above 0; got 100000 um and 0 um"),
+        (overwritten(68, struct.pack("<I", 256)), "up to 255 viewpoints, got 256"),
+        (overwritten(68, struct.pack("<I", 200)), "cannot hold 200 viewpoints"),
+        (overwritten(92, struct.pack("<I", 4_000_000_000)), "views of 4000000000 bytes"),
+        (overwritten(92, struct.pack("<I", 5)), "8 bytes or more"),
+        (overwritten(92, struct.pack("<I", 40)), "1 to 255 cameras .* got 0 and 0"),
+        (overwritten(68, struct.pack("<I", 1), 116, struct.pack("<f", float("-inf"))), "viewpoints .* finite"),
     ],
 )
 def test_clouds_that_no_hull_makes_are_refused(msg: PointCloud2, words: str) -> None:

@@ -11,7 +11,7 @@ import pytest
 from flesh_hulls import moved
 
 from limbloc_ros.core import figure, tracker
-from limbloc_ros.core.engine_robust import SETTLED_M, Fit
+from limbloc_ros.core.engine_robust import SETTLED_M, Fit, Refined
 from limbloc_ros.core.figure import BONE, FigureState, place
 from limbloc_ros.core.hull import Hull
 from limbloc_ros.core.limb_pairs import with_limb
@@ -112,11 +112,27 @@ def test_a_limb_must_explain_the_more_the_further_it_jumps_and_the_worse_the_hul
     monkeypatch.setattr(tracker.Medial, "of", lambda hull: None)
     monkeypatch.setattr(tracker, "with_one_limb", lambda *args: [there])
     monkeypatch.setattr(tracker, "unseen", lambda state, hull: 0.0)
-    found = SimpleNamespace(state=there, system=costing((1.0 - gain) * cost))
+    found = SimpleNamespace(state=there, system=costing((1.0 - gain) * cost), energy=costing(cost))
     monkeypatch.setattr(tracker, "refine", lambda *args: found)
     followed = SimpleNamespace(state=here, system=costing(cost))
-    checked = Tracker(seed=0)._check_limbs([(ARM, "L")], 1, followed, None, None, None, None, 0.0)
+    checked = Tracker(seed=0)._check_limbs([(ARM, "L")], 1, followed, None, None, None, None, 0.0, 0.0)
     assert (checked is found) == believed
+
+
+def test_no_further_limb_is_looked_for_when_the_energy_is_bearable_again(monkeypatch):
+    here, there = FigureState.standing([0.0, 0.0, 1.0]), FigureState.standing([0.06, 0.0, 1.0])
+    monkeypatch.setattr(tracker, "make_scene", lambda *args: SimpleNamespace(quick=None, lenient=None))
+    monkeypatch.setattr(tracker.Medial, "of", lambda hull: None)
+    monkeypatch.setattr(tracker, "unseen", lambda state, hull: 0.0)
+    monkeypatch.setattr(tracker, "refine", lambda *args: Refined(there, costing(1e-4), costing(1e-4), "converged"))
+    for bearable, expected in ((1.01e-4, ["L"]), (0.99e-4, ["L", "R"])):
+        asked = []
+        monkeypatch.setattr(
+            tracker, "with_one_limb", lambda s, scene, kind, side, *args, a=asked: a.append(side) or [there]
+        )
+        followed = Refined(here, costing(2e-4), costing(2e-4), "converged")
+        Tracker(seed=0)._check_limbs([(ARM, "L"), (ARM, "R")], 1, followed, None, None, None, None, 0.0, bearable)
+        assert asked == expected
 
 
 def test_inertia_steadies_the_joints(monkeypatch):
@@ -256,17 +272,17 @@ class Stand:
             self.refined.append((self.frame, state, iterations))
         cost = self.costs.get(self.frame, 1e-4)
         settled = FigureState.standing(state.root)
-        return SimpleNamespace(state=settled, system=costing(cost), stop="iterations")
+        return Refined(settled, costing(cost), costing(cost), "iterations")
 
     def system(self, state, evidence, weights):
         self.guessed.append((self.frame, state))
         return costing(self.costs.get(self.frame, 1e-4))
 
-    def check(self, limbs, places, result, hull, surface, evidence, size, settled_m):
+    def check(self, limbs, places, result, hull, surface, evidence, size, settled_m, bearable):
         hasty = len(limbs) == 4
         assert (settled_m, places) == ((0.0, Tracker.HASTY_PLACES) if hasty else (SETTLED_M, Tracker.PLACES))
         self.checked.append((self.frame, [f"{kind.bones[0]}_{side}" for kind, side in limbs]))
-        return SimpleNamespace(**vars(result)) if self.frame in self.found else result
+        return replace(result) if self.frame in self.found else result
 
     def run(self, follower, frames, centres=None):
         costs = []
@@ -390,12 +406,36 @@ def test_nobody_and_somebody_again(stand):
     assert stand.search_frames == [1, 2, 3, 4]
 
 
-def test_half_a_person_in_the_doorway_is_searched_quickly_and_again_when_whole(stand):
+def test_who_comes_in_is_searched_when_wholly_there(stand):
     stand.cut = set(range(1, 6))
+    assert stand.run(Tracker(seed=0), 7) == [None] * 5 + [1e-4] * 2
+    assert [(frame, len(searches)) for frame, *_, searches in stand.searched] == [(6, 1)]  # quickly
+
+
+def test_who_stays_in_the_doorway_is_searched_quickly_and_again_when_whole(stand):
+    long = Tracker.DOORWAY
+    stand.cut = set(range(1, long + 5))
     stand.scratch_cost = 6.5e-4  # hopeless
-    stand.costs = dict.fromkeys(range(1, 20), 10e-4)
-    stand.run(Tracker(seed=0), 7)
-    assert [(frame, len(searches)) for frame, *_, searches in stand.searched] == [(1, 1), (6, 1), (7, 1)]
+    stand.costs = dict.fromkeys(range(1, long + 20), 10e-4)
+    costs = stand.run(Tracker(seed=0), long + 6)
+    assert [cost is None for cost in costs] == [True] * long + [False] * 6
+    searched = [(frame, len(searches)) for frame, *_, searches in stand.searched]
+    assert searched == [(long + 1, 1), (long + 5, 1), (long + 6, 1)]
+
+
+def test_who_is_followed_out_of_the_room_stays_followed(stand):
+    stand.cut = set(range(5, 9))
+    assert None not in stand.run(Tracker(seed=0), 10)
+
+
+def test_when_all_is_wrong_and_a_search_is_due_no_limb_is_looked_for(stand):
+    """Of an energy that no limb explains: the search comes at once, in this frame."""
+    hopeless = 1.01 * Tracker.HOPELESS * Tracker.DOUBTFUL_COST
+    stand.costs = dict.fromkeys(range(9, 12), hopeless)
+    stand.scratch_cost = 0.99 * hopeless  # in vain
+    stand.run(Tracker(seed=0), 10)
+    assert stand.search_frames == [1, 9]
+    assert [frame for frame, limbs in stand.checked if limbs == ALL_LIMBS] == [10]  # while the next search is not due
 
 
 def test_reset_forgets_everything(stand):

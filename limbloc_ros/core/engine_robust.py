@@ -20,7 +20,6 @@ from limbloc_ros.core.surface import Surface
 from limbloc_ros.core.views import Views
 
 Array = NDArray[np.float64]
-Refined = lm.LmResult[FigureState]
 #: Figures that explain the hull nearly as well as the best of them, each with its energy over that one's.
 Rivals = tuple[tuple[FigureState, float], ...]
 #: How likely (0 to 1) a figure is wrong, by something that the search does not look at.
@@ -173,6 +172,23 @@ def outline_rays(hull: Hull, surface: Surface, rows: NDArray[np.int64]) -> Array
     return np.where(known[:, None], rays, 0.0)
 
 
+@dataclass(frozen=True)
+class Refined:
+    """What a refinement found.
+
+    Attributes:
+        state: the figure.
+        system: of energy and priors there.
+        energy: of the energy alone.
+        stop: of `lm.LmResult`.
+    """
+
+    state: FigureState
+    system: lm.System
+    energy: lm.System
+    stop: str
+
+
 def refine(
     state: FigureState,
     evidence: Evidence,
@@ -180,26 +196,31 @@ def refine(
     iterations: int,
     priors: Sequence[Prior] = (),
     known: lm.System | None = None,
-) -> lm.LmResult[FigureState]:
-    """Levenberg-Marquardt on all parameters at once; `known` is `energy.system` of the state, where that is known."""
+) -> Refined:
+    """Levenberg-Marquardt on all parameters at once; `known` is the energy's system at the state, if it is known."""
     step = np.full(3 + figure.N_DOF + len(state.shape), 0.5)
     step[:3] = 0.1
     step[3 + figure.N_DOF] = 0.1
     step[4 + figure.N_DOF :] = 1.0
+    energies: list[tuple[FigureState, lm.System]] = []
 
-    def with_priors(system: lm.System, s: FigureState) -> lm.System:
+    def evaluate(at: FigureState, alone: lm.System | None = None) -> lm.System:
+        system = alone or energy.system(at, evidence, weights)
+        energies.append((at, system))
         for prior in priors:
-            system = system + prior.system(s)
+            system = system + prior.system(at)
         return system
 
-    return lm.minimise(
-        lambda s: with_priors(energy.system(s, evidence, weights), s),
+    found = lm.minimise(
+        evaluate,
         lambda s, delta: s.moved(delta),
         state,
         iterations=iterations,
         largest_step=step,
-        known=None if known is None else with_priors(known, state),
+        known=evaluate(state, known),
     )
+    alone = next(system for at, system in reversed(energies) if at is found.state)
+    return Refined(found.state, found.system, alone, found.stop)
 
 
 @dataclass(frozen=True)

@@ -34,10 +34,6 @@ class System:
         """Of the sum of two costs."""
         return System(self.cost + other.cost, self.gradient + other.gradient, self.matrix + other.matrix)
 
-    def __sub__(self, other: System) -> System:
-        """Of a sum without one of its terms."""
-        return System(self.cost - other.cost, self.gradient - other.gradient, self.matrix - other.matrix)
-
 
 @dataclass(frozen=True)
 class LmResult(Generic[State]):

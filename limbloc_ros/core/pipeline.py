@@ -18,6 +18,7 @@ from limbloc_ros.core.config import FitConfig, HullConfig, validated
 from limbloc_ros.core.errors import NoPerson
 from limbloc_ros.core.hull import Hull, carve_silhouettes, largest_component
 from limbloc_ros.core.pose import Flesh, Pose
+from limbloc_ros.core.shown import forearm_depths_m
 from limbloc_ros.core.silhouettes import measure_silhouettes, pack_cameras
 from limbloc_ros.core.surface import extract_surface
 from limbloc_ros.core.tracker import Tracker
@@ -110,7 +111,8 @@ class PoseEstimator:
             fit = engine_robust.fit_from_scratch(hull, surface, self.config.seed, risk_of=risk_of)
         clock.lap("fit")
         if fit is None:
-            return NoPerson("the hull holds nothing that a torso fits into")
+            outside = "" if hull.cut_area_m2 < Tracker.HALF_M2 else ": somebody is half outside of the carve volume"
+            return NoPerson(f"the hull holds nothing that a torso fits into{outside}")
         pose = describe_pose(fit.state, judge, fit.system, clock.stage_ms, fit.rivals)
         return self._wariness.judge(pose) if self.config.temporal else pose
 
@@ -129,7 +131,9 @@ class PoseEstimator:
         estimator = PoseEstimator(FitConfig(temporal=True))
         estimator._tracker = _Trusting(0, searches=(_LEAST_EFFORT,))
         estimator.estimate(hull)
-        estimator.estimate(hull)
+        pose = estimator.estimate(hull)
+        assert isinstance(pose, Pose)
+        forearm_depths_m(pose.flesh)  # only asked of figures that match their hulls
 
 
 class _Stopwatch:

@@ -99,6 +99,16 @@ class SizeMemory:
         n_shape = figure.proportions().n_shape
         return SizeMemory(0, np.zeros((n_shape, n_shape)), np.zeros(n_shape), (np.zeros((4, 3)), np.zeros((4, 3))))
 
+    def after(self, size: KnownSize, state: FigureState, system: System) -> SizeMemory:
+        """After one more frame, fitted with this size: of that frame alone when it contradicts the size.
+
+        Args:
+            size: what was known before the frame.
+            state, system: its figure, and the energy's system there, without that of the size.
+        """
+        contradicted = size.cost(state.shape) > self.CONTRADICTED * system.cost
+        return (SizeMemory.nothing() if contradicted else self).with_frame(state, system)
+
     def with_frame(self, state: FigureState, system: System) -> SizeMemory:
         """After one more frame: its figure, and the energy's system there."""
         information, pull = _of_the_shape(state.shape, system)

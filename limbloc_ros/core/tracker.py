@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from limbloc_ros.core import energy, figure, lm
+from limbloc_ros.core import energy, figure
 from limbloc_ros.core.energy import Evidence, Weights
 from limbloc_ros.core.engine_robust import (
     HARDER,
@@ -18,6 +18,7 @@ from limbloc_ros.core.engine_robust import (
     SETTLED_M,
     Effort,
     Fit,
+    Refined,
     RiskOf,
     apart_m,
     firm,
@@ -35,7 +36,6 @@ from limbloc_ros.core.search import ARM, LEG, LimbKind, Medial
 from limbloc_ros.core.surface import Surface
 
 Array = NDArray[np.float64]
-Result = lm.LmResult[FigureState]
 
 LIMBS = [(kind, side) for kind in (ARM, LEG) for side in "LR"]
 
@@ -58,8 +58,8 @@ class Tracker:
     #: several figures explain a ragged hull nearly equally well, each search ends with another one.
     BETTER = 0.3
     #: A hull that the walls of the carve volume cut by so much, m^2 (an arm is a hundredth), is half a person in the
-    #: doorway: not worth more than a quick search, until it is whole.
-    HALF_M2 = 0.10
+    #: doorway: whoever comes in is searched when wholly there, or after so many frames; both quickly.
+    HALF_M2, DOORWAY = 0.10, 10
     #: What is searched when starting anew: less than for a frame alone, for the next frames can mend it. All that there
     #: is only for somebody who was not followed yet and whose figure is doubtful.
     SEARCHES = (
@@ -83,7 +83,12 @@ class Tracker:
     #: the search, which lead from further off; so many more with the final ones put its joints in their places. (With 5
     #: and 4, or 8 and 4, a wrist is 10 to 18 cm off in 4 and 8 of 1320 frames, with these in none; with limbs checked
     #: in every third frame wrists of raised arms stay as far behind in rough hulls.)
-    STEPS, FAR_STEPS, FINAL_STEPS = 8, 20, 6
+    STEPS, FAR_STEPS, FINAL_STEPS = 5, 20, 6
+    #: A limb that settled elsewhere is first carried on by so many steps, and given up when the energy is then so many
+    #: times what it was: of those that win in the end, 1.18 times at most.
+    FIRST_STEPS, GIVEN_UP = 2, 1.3
+    #: When the energy is so many times a doubtful one and a search is due, it is the figure that is wrong, no limb.
+    HOPELESS = 2.0
     #: Joints go on moving by this share of their last step; what it costs in the final refinement that they do not, and
     #: from which distance on that says that they move otherwise. (All of the step would be less jitter still, but
     #: carries limbs beyond their places when they stop; three times the weight leaves turning people behind.)
@@ -106,6 +111,7 @@ class Tracker:
         self._frame = 0
         self._last_scratch = -self.PATIENCE
         self._wait, self._vain, self._last_cut = self.PATIENCE, False, False
+        self._in_doorway = 0
         self._centre = np.zeros(3)
         self._sizes = SizeMemory.nothing()
 
@@ -117,10 +123,14 @@ class Tracker:
             risk_of: of `fit_from_scratch`.
 
         Returns:
-            the fit, or None when there is no figure yet and no torso fits into the hull.
+            the fit, or None when there is no figure yet, and no torso fits into the hull or half a person came in.
         """
         self._frame += 1
         cut = hull.cut_area_m2 >= self.HALF_M2
+        came_in = self._in_doorway > 0 and not cut
+        self._in_doorway = self._in_doorway + 1 if cut else 0
+        if self._last is None and 0 < self._in_doorway <= self.DOORWAY:
+            return None
         fit: Fit | None = None
         before = self._last
         centre = surface.points.mean(axis=0)
@@ -133,22 +143,19 @@ class Tracker:
             size = self._sizes.known(self._weights.proportions)
             steps = self.STEPS if np.abs(moved).max() < 0.1 else self.FAR_STEPS
             result = refine(guesses[best], evidence, self._firm, steps, (size,), systems[best])
-            if not cut:
+            if not cut and not (self._hopeless(result.system.cost) and self._search_is_due(cut)):
                 result = self._with_limbs_checked(result, hull, surface, evidence, size)
-            judged = result.system.cost - size.cost(result.state.shape)
+            judged = result.energy.cost
             inertia = Inertia(self._expected_joints(self._last, moved), self.INERTIA, self.INERTIA_WIDTH_M)
             final = refine(result.state, evidence, self._weights, self.FINAL_STEPS, (size, inertia))
-            alone = final.system - size.system(final.state) - inertia.system(final.state)
-            contradicted = size.cost(final.state.shape) > SizeMemory.CONTRADICTED * alone.cost
-            sizes = SizeMemory.nothing() if contradicted else self._sizes
-            self._sizes = sizes.with_frame(final.state, alone)
+            self._sizes = self._sizes.after(size, final.state, final.energy)
             fit = Fit(final.state, final.system, judged=judged)
         if fit is None or self._doubts(fit.judged, cut):
             self._last_scratch, self._last_cut = self._frame, cut
             if fit is not None:
                 fit = replace(fit, unseen=unseen(fit.state, hull))
             searches = self._searches
-            if cut or (fit is not None and not self._vain):
+            if cut or came_in or (fit is not None and not self._vain):
                 searches = searches[:1]
             elif fit is not None:  # what the quick search missed is searched harder the next time
                 searches = searches[:2]
@@ -189,19 +196,25 @@ class Tracker:
             return joints + moved
         return joints + self.PACE * (joints - figure.place(self._before).joints)
 
-    def _doubts(self, cost: float, cut: bool) -> bool:
+    def _search_is_due(self, cut: bool) -> bool:
         whole_now = self._last_cut and not cut
-        waited = self._frame - self._last_scratch >= (1 if whole_now else self._wait)
-        return waited and (cost > self.DOUBT * self._usual_cost or cost > self.DOUBTFUL_COST)
+        return self._frame - self._last_scratch >= (1 if whole_now else self._wait)
+
+    def _doubts(self, cost: float, cut: bool) -> bool:
+        doubtful = cost > self.DOUBT * self._usual_cost or cost > self.DOUBTFUL_COST
+        return doubtful and self._search_is_due(cut)
+
+    def _hopeless(self, cost: float) -> bool:
+        return cost > self.HOPELESS * self.DOUBTFUL_COST
 
     def _with_limbs_checked(
-        self, result: Result, hull: Hull, surface: Surface, evidence: Evidence, size: KnownSize
-    ) -> Result:
+        self, result: Refined, hull: Hull, surface: Surface, evidence: Evidence, size: KnownSize
+    ) -> Refined:
         """A limb that moved too fast, or has slipped into the trunk, stays behind: look for it elsewhere."""
         bearable = min(self.LIMB_DOUBT * self._usual_cost, self.DOUBTFUL_COST)
         if self._frame < self._next_doubt:
             bearable = max(bearable, self.LIMB_DOUBT * self._vain_cost)
-        cost = result.system.cost - size.cost(result.state.shape)
+        cost = result.energy.cost
         hasty = cost > bearable
         if hasty:
             if result.stop == "iterations":
@@ -213,7 +226,7 @@ class Tracker:
         else:
             return result
         places, settled_m = (self.HASTY_PLACES, 0.0) if hasty else (self.PLACES, SETTLED_M)
-        checked = self._check_limbs(limbs, places, result, hull, surface, evidence, size, settled_m)
+        checked = self._check_limbs(limbs, places, result, hull, surface, evidence, size, settled_m, bearable)
         self._next_check = self._frame + self.TURN
         if checked is not result:
             self._doubt_wait, self._next_doubt = 1, self._frame + 1
@@ -226,15 +239,20 @@ class Tracker:
         self,
         limbs: Sequence[tuple[LimbKind, str]],
         places: int,
-        result: Result,
+        result: Refined,
         hull: Hull,
         surface: Surface,
         evidence: Evidence,
         size: KnownSize,
         settled_m: float,
-    ) -> Result:
-        """The figure, or it with one of these limbs after the other elsewhere, but for those that settle near it."""
+        bearable: float,
+    ) -> Refined:
+        """The figure, or it with one of these limbs after the other elsewhere, but for those that settle near it.
+
+        No further limb is looked for once the energy is bearable again.
+        """
         scene = make_scene(hull, Medial.of(hull), surface, self._seed, self._weights, QUICK)
+        missed = unseen(result.state, hull)
         for kind, side in limbs:
             for state in with_one_limb(result.state, scene, kind, side, places, QUICK.candidates):
                 if apart_m(state, result.state) < SAME_PLACE_M:
@@ -242,13 +260,18 @@ class Tracker:
                 settled = refine(state, scene.quick, scene.lenient, 5, (size,)).state
                 if apart_m(settled, result.state) < settled_m:
                     continue
-                other = refine(settled, evidence, self._firm, 8, (size,))
-                gain = result.system.cost - other.system.cost
-                gain += unseen(result.state, hull) - unseen(other.state, hull)
+                other = refine(settled, evidence, self._firm, self.FIRST_STEPS, (size,))
+                if other.system.cost > self.GIVEN_UP * result.system.cost:
+                    continue
+                other = refine(other.state, evidence, self._firm, self.STEPS, (size,), other.energy)
+                other_missed = unseen(other.state, hull)
+                gain = result.system.cost + missed - other.system.cost - other_missed
                 jumps = max(1.0, apart_m(other.state, result.state) / self.JUMP_M)
                 ragged = max(1.0, result.system.cost / self.DOUBTFUL_COST)
                 if gain > self.LIMB_GAIN * jumps * ragged * result.system.cost:
-                    result = other
+                    result, missed = other, other_missed
+                    if result.energy.cost <= bearable:
+                        return result
         return result
 
 

@@ -2,10 +2,13 @@
 """Hull and surface <-> sensor_msgs/PointCloud2.
 
 The hull's cloud holds the inside and a thin shell: per voxel its centre (`x y z`, so that RViz shows it as it is), the
-signed distance `sdf` in metres, and what rebuilds the exact grid of the offline path: the lattice indices `i j k`, the
-voxel size and the band in whole micrometres. `camera` numbers the camera whose silhouette cut the hull there, `vp_x
-vp_y vp_z` is where that camera stands. `views` holds what the cameras saw, by which figures are judged: the number of
-its bytes and then these, four in each voxel's. An empty cloud says that nobody is there.
+signed distance `sdf` in metres, and the number of the `camera` whose silhouette cut the hull there (NOBODY: unknown).
+Numbers survive exactly, so that the grid is the offline path's bit for bit.
+
+`extra` holds what belongs to the hull as a whole, four bytes in each voxel's: the voxel size and the band in whole
+micrometres, the number of viewpoints, the number of bytes of the views; the viewpoints, where the cameras stand
+(float32 x y z, m); the views, what the cameras saw, by which figures are judged. A hull of fewer voxels than that takes
+repeats the last one. An empty cloud says that nobody is there.
 """
 
 from __future__ import annotations
@@ -28,32 +31,20 @@ from limbloc_ros.ros import _cloud_kernels as kernels
 
 HULL_POINT = np.dtype(
     {
-        "names": [
-            "x",
-            "y",
-            "z",
-            "sdf",
-            "i",
-            "j",
-            "k",
-            "camera",
-            "voxel_um",
-            "band_um",
-            "vp_x",
-            "vp_y",
-            "vp_z",
-            "views",
-        ],
-        "formats": ["<f4", "<f4", "<f4", "<f4", "<i2", "<i2", "<i2", "<u2", "<u4", "<u4", "<f4", "<f4", "<f4", "<u4"],
-        "offsets": [0, 4, 8, 12, 16, 18, 20, 22, 24, 28, 32, 36, 40, 44],
-        "itemsize": 48,
+        "names": ["x", "y", "z", "sdf", "camera", "extra"],
+        "formats": ["<f4", "<f4", "<f4", "<f4", "<u2", "<u4"],
+        "offsets": [0, 4, 8, 12, 16, 20],
+        "itemsize": 24,
     }
 )
+#: How far from the centre of a voxel, in voxels, a point may lie: float32 is that exact for all indices that we send.
+ASTRAY = 0.01
+NOWHERE = np.zeros((0, 3), np.float32)
 SURFACE_POINT = np.dtype(
     [(name, "<f4") for name in ("x", "y", "z", "normal_x", "normal_y", "normal_z", "curvature", "geodesic")]
 )
 
-_DATATYPES = {"<f4": PointField.FLOAT32, "<i2": PointField.INT16, "<u2": PointField.UINT16, "<u4": PointField.UINT32}
+_DATATYPES = {"<f4": PointField.FLOAT32, "<u2": PointField.UINT16, "<u4": PointField.UINT32}
 
 
 def _fields(point: np.dtype[np.void]) -> list[PointField]:
@@ -105,20 +96,24 @@ def hull_to_cloud(hull: Hull, header: Header) -> PointCloud2:
             f"the hull's voxels have indices {low} to {high}; expected -32768 to 32767: "
             "move the world's origin into the room, or use larger voxels"
         )
-    data = array("B", bytes(1)) * (count * HULL_POINT.itemsize)
-    words = np.frombuffer(data, np.uint32).reshape(count, -1)  # the message's own memory
     cut_by = hull.cut_by if hull.cut_by is not None else np.zeros((0, 0, 0), np.uint8)
+    viewpoints = hull.viewpoints if kernels.somebody_cut(hull.sdf, band, cut_by, len(hull.viewpoints)) else NOWHERE
+    extra = _extra(hull, viewpoints)
+    data = array("B", bytes(1)) * (max(count, len(extra)) * HULL_POINT.itemsize)
+    words = np.frombuffer(data, np.uint32).reshape(-1, HULL_POINT.itemsize // 4)  # the message's own memory
     kernels.write_rows(
-        words, words.view(np.float32), words.view(np.int16), hull.sdf, band, np.array(hull.index_min), cut_by,
-        hull.viewpoints, NOBODY, hull.voxel_m, round(hull.voxel_m * 1e6), round(hull.band_m * 1e6),
+        words, words.view(np.float32), hull.sdf, band, np.array(hull.index_min), cut_by, len(viewpoints), NOBODY,
+        hull.voxel_m, extra,
     )  # fmt: skip
-    if hull.views is not None:
-        packed = hull.views.packed
-        padded = np.frombuffer(packed + bytes(-len(packed) % 4), "<u4")
-        if len(padded) < len(words):
-            words[0, 11] = len(packed)
-            words[1 : 1 + len(padded), 11] = padded
     return _cloud(data, HULL_POINT, _HULL_FIELDS, header)
+
+
+def _extra(hull: Hull, viewpoints: NDArray[np.float32]) -> NDArray[np.uint32]:
+    """What is sent once per hull, in words."""
+    views = b"" if hull.views is None else hull.views.packed
+    sizes = np.array([round(hull.voxel_m * 1e6), round(hull.band_m * 1e6), len(viewpoints), len(views)], "<u4")
+    padded = views + bytes(-len(views) % 4)
+    return np.frombuffer(sizes.tobytes() + viewpoints.astype("<f4").tobytes() + padded, "<u4").astype(np.uint32)
 
 
 def empty_hull_cloud(header: Header) -> PointCloud2:
@@ -150,26 +145,39 @@ def cloud_to_hull(msg: PointCloud2) -> Hull | None:
     if count == 0:
         return None
     words = np.require(np.frombuffer(msg.data, np.uint32).reshape(count, -1), requirements="W")
-    voxel_um, band_um = int(words[0, 6]), int(words[0, 7])
-    indices, sdf, camera, viewpoints, widest, highest, largest, same = kernels.read_rows(
-        words, words.view(np.float32), words.view(np.int16), NOBODY
-    )
-    if voxel_um == 0 or band_um == 0 or not same:
-        raise InputError(
-            f"a hull has one voxel size and one band above 0; got {voxel_um} um, {band_um} um or a mixture"
-        )
-    voxel_m, band_m = voxel_um / 1e6, band_um / 1e6
+    voxel_m, band_m, viewpoints, views = _read_extra(words[:, 5])
+    indices, sdf, camera, widest, highest, largest, astray = kernels.read_rows(words, words.view(np.float32), voxel_m)
+    if not astray < ASTRAY:
+        raise InputError(f"the points of a hull's cloud must be centres of voxels of {voxel_m} m, not too far away")
     if not widest < 100.0 or not highest < np.float32(band_m):
         raise InputError(f"signed distances of a hull's cloud must be finite and below the band of {band_m} m")
     if largest > NOBODY:
         raise InputError(f"a hull's cloud numbers cameras up to {NOBODY} (nobody), got {largest}")
-    views = _views(words[:, 11])
     if len(viewpoints) == 0:
         return replace(Hull.from_shell(voxel_m, band_m, indices, sdf), views=views)
-    if not np.isfinite(viewpoints).all():
-        raise InputError("the places of cameras (vp_x, vp_y, vp_z) in a hull's cloud must be finite")
     hull = Hull.from_shell(voxel_m, band_m, indices, sdf, cut_by=camera, viewpoints=viewpoints)
     return replace(hull, views=views)
+
+
+def _read_extra(words: NDArray[np.uint32]) -> tuple[float, float, NDArray[np.float32], Views | None]:
+    """Voxel size, band, viewpoints and views."""
+    if len(words) < 4:
+        raise InputError(f"a hull's cloud has 4 points or more, got {len(words)}")
+    voxel_um, band_um, cameras, size = (int(word) for word in words[:4])
+    if voxel_um == 0 or band_um == 0:
+        raise InputError(f"a hull has a voxel size and a band above 0; got {voxel_um} um and {band_um} um")
+    if cameras > NOBODY:
+        raise InputError(f"a hull's cloud has up to {NOBODY} viewpoints, got {cameras}")
+    begin = 4 + 3 * cameras
+    if begin + -(-size // 4) > len(words):
+        raise InputError(
+            f"a hull's cloud of {len(words)} points cannot hold {cameras} viewpoints and views of {size} bytes"
+        )
+    viewpoints = words[4:begin].copy().view(np.float32).reshape(-1, 3)
+    if not np.isfinite(viewpoints).all():
+        raise InputError("the viewpoints in a hull's cloud must be finite")
+    views = Views.unpacked(words[begin : begin + -(-size // 4)].tobytes()[:size]) if size else None
+    return voxel_um / 1e6, band_um / 1e6, viewpoints, views
 
 
 @functools.cache  # once per process
@@ -178,16 +186,6 @@ def warm_up() -> None:
     sdf = np.full((3, 3, 3), 0.06, np.float32)
     sdf[1, 1, 1] = -0.01
     cloud_to_hull(hull_to_cloud(Hull(0.02, (0, 0, 0), sdf, 0.06), Header()))
-
-
-def _views(words: NDArray[np.uint32]) -> Views | None:
-    """The views that a cloud carries, if it does."""
-    count = int(words[0])
-    if count == 0:
-        return None
-    if count > 4 * (len(words) - 1):
-        raise InputError(f"a hull's cloud of {len(words)} points cannot hold views of {count} bytes")
-    return Views.unpacked(words[1 : 1 + -(-count // 4)].tobytes()[:count])
 
 
 def surface_to_cloud(surface: Surface, geodesic: NDArray[np.float64], header: Header) -> PointCloud2:
