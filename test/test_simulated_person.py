@@ -10,7 +10,7 @@ from limbloc_ros.core.errors import ConfigError, InputError
 from limbloc_ros.core.pose import JOINT, JOINT_NAMES
 from limbloc_ros.simulation import _quaternions as quat
 from limbloc_ros.simulation.motion import PLAYLIST, Motion, motion_names
-from limbloc_ros.simulation.person import PERSON_NAMES, load_person
+from limbloc_ros.simulation.person import PERSON_NAMES, Person, baked, load_person
 from limbloc_ros.simulation.retarget import LINK, LINKS, Retarget
 from limbloc_ros.simulation.room import default_rig
 
@@ -65,6 +65,17 @@ def test_people_differ_as_their_names_say() -> None:
         return float(np.ptp(person.vertices[waist & (np.abs(person.vertices[:, 1]) < 0.25), 0]) / person.stature_m)
 
     assert girth("heavy") > 1.15 * girth("woman")
+
+
+def test_people_of_a_file_without_clothes_are_bare() -> None:
+    arrays = {key: value for key, value in baked("people.npz").items() if key != "garments"}
+    for index, name in enumerate(arrays["names"].tolist()):
+        bare, dressed = Person.from_arrays(f"person {index}", arrays, index), load_person(name)
+        assert bare.name == f"person {index}"
+        assert (bare.garments < 0).all() and bare.garments.shape == dressed.garments.shape
+        assert (dressed.garments > 0).any()
+        for key in ("vertices", "bone_heads", "joint_rest", "skin_weights"):
+            np.testing.assert_array_equal(getattr(bare, key), getattr(dressed, key))
 
 
 def test_skinning_equals_its_plain_reference() -> None:

@@ -97,20 +97,8 @@ def people(path: Path) -> Iterator[Person]:
     """Those of a file of `bake_population.py`."""
     with np.load(path, allow_pickle=False) as file:
         data = {key: file[key] for key in file.files}
-    for k, vertices in enumerate(data["vertices"].astype(float)):
-        yield Person(
-            name=f"person {k}",
-            vertices=vertices,
-            faces=data["faces"].astype(np.int32),
-            bone_names=tuple(str(name) for name in data["bone_names"]),
-            bone_parents=data["bone_parents"].astype(np.int64),
-            bone_heads=data["bone_heads"][k].astype(float),
-            skin_bones=data["skin_bones"].astype(np.int64),
-            skin_weights=data["skin_weights"] / 255.0,
-            joint_bones=data["joint_bones"].astype(np.int64),
-            joint_rest=data["joint_rest"][k].astype(float),
-            garments=np.full((len(vertices), 4), -0.1),
-        )
+    for k in range(len(data["vertices"])):
+        yield Person.from_arrays(f"person {k}", data, k)
 
 
 def random_rig(rng: np.random.Generator, n: int) -> Rig:

