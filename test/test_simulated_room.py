@@ -255,6 +255,20 @@ def test_the_person_stands_out_from_the_room_but_not_everywhere(name: str) -> No
     assert np.mean(contrast <= 24) > 0.002
 
 
+def test_silhouettes_of_a_posture_are_those_of_the_instant_that_has_it() -> None:
+    room = quiet_room()
+    images = {name: room.render_with_mask(name, 7.0) for name in room.rig.names}
+    for t in (9.0, 7.0):  # the last one leaves nothing behind
+        posed = room.motion.pose(t)
+        assert posed is not None
+        masks = room.silhouettes(posed)
+    assert list(masks) == list(room.rig.names)
+    for name, (image, mask) in images.items():
+        assert mask.any()
+        np.testing.assert_array_equal(masks[name], mask)
+        np.testing.assert_array_equal(room.render(name, 7.0), image)  # nor do they in what is drawn next
+
+
 # ---- several people ----
 
 

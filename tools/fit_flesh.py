@@ -132,8 +132,7 @@ def hulls_of(person: Person, n_cameras: int, frames: int, rng: np.random.Generat
         for name, vector in vectors.items():
             turned[person.bone(name)] = turned[person.bone(name)] @ Rotation.from_rotvec(vector).as_matrix()
         posed = person.pose(turned, posed.bone_positions[person.bone("root")])
-        room.motion._last = (t, posed)  # what the room draws at this time
-        hull = carver.carve({name: room.render_with_mask(name, t)[1] for name in rig.names})
+        hull = carver.carve(room.silhouettes(posed))
         if isinstance(hull, Hull) and hull.cut_area_m2 == 0.0:
             yield largest_component(hull), posed.joints
 
@@ -209,6 +208,14 @@ def flesh_system(example: Example) -> System:
     return System(float(cost), g, A)
 
 
+def settle(examples: list[Example], what: str) -> None:
+    """Let the figures follow the flesh as it is now, their joints held."""
+    for example in tqdm(examples, desc=what, leave=False):
+        loose = KnownSize(example.shape, np.diag(np.r_[1e-3, np.full(len(example.shape) - 1, 2e-5)]))
+        priors = HeldJoints(example.joints, HOLD), loose
+        example.state = refine(example.state, example.evidence, Weights(), 6, priors).state
+
+
 def improved(change: Array, examples: list[Example]) -> tuple[Array, float]:
     """The change of the flesh [OWN, 4, 1 + K] after another step, and the mean cost (m^2) before it."""
     n, k = 4 * len(OWN), change.shape[2]
@@ -277,21 +284,22 @@ def main() -> None:
 
     change = np.zeros((len(OWN), 4, centres.shape[2]))
     for step in range(arguments.steps):
-        for example in tqdm(examples, desc=f"step {step}", leave=False):
-            loose = KnownSize(example.shape, np.diag(np.r_[1e-3, np.full(len(example.shape) - 1, 2e-5)]))
-            priors = HeldJoints(example.joints, HOLD), loose
-            example.state = refine(example.state, example.evidence, Weights(), 6, priors).state
+        settle(examples, f"step {step}")
         change, cost = improved(change, examples)
         of_all = change[ROW] * MIRROR[:, :, None] * FREE[ROW][:, :, None]
         grown = radii + of_all[:, 3]
         grown[:, 0] = np.maximum(grown[:, 0], SMALLEST_RADIUS)
         set_flesh(centres + of_all[:, :3], grown)
-        print(f"step {step}: {len(examples)} hulls, mean energy {1e4 * cost:.3f} cm^2")
+        print(f"before step {step}: {len(examples)} hulls, mean energy {1e4 * cost:.3f} cm^2")
 
     spread = np.linalg.norm(grown[:, 1:], axis=1, keepdims=True)
     grown[:, 1:] *= np.minimum(1.0, LARGEST_SPREAD * grown[:, :1] / spread)
     body["sphere_centres"], body["sphere_radii"] = (a.astype(np.float32) for a in (centres + of_all[:, :3], grown))
     body["joint_offsets"] = joint_offsets(examples, names, offsets).astype(np.float32)
+    set_flesh(body["sphere_centres"], body["sphere_radii"])  # the one that is written
+    settle(examples, "at last")
+    cost = float(np.mean([flesh_system(example).cost for example in examples]))
+    print(f"at last: {len(examples)} hulls, mean energy {1e4 * cost:.3f} cm^2")
     np.savez_compressed(arguments.output, **body)
 
 

@@ -214,7 +214,7 @@ class SimulatedRoom:
         instant = self._instant_at(t)
         if instant is not None:
             self._draw_shadow(view, instant)
-            self._draw(view, instant)
+            self._draw(view, instant.lit)
         if out is None:
             out = np.empty_like(view.scene)
         place = [self.seed, view.index, round(t * 1e6) & 0xFFFFFFFF]
@@ -230,6 +230,17 @@ class SimulatedRoom:
             RigError: no such camera.
         """
         return self.render(camera_name, t), self._view(camera_name).mask.copy()
+
+    def silhouettes(self, posed: PosedPerson) -> dict[str, Mask]:
+        """The true silhouettes (255 = person) of the first person, alone and in any posture, by camera."""
+        lit = (_light(posed, self.person, self._tone, self._stripe, self._palette),)
+        masks = {}
+        for name in self.rig.names:
+            view = self._view(name)
+            view.clear()
+            self._draw(view, lit)
+            masks[name] = view.mask.copy()
+        return masks
 
     def warm_up(self) -> None:
         """Compile or load every kernel and look at the empty room, so that the first images are not late."""
@@ -310,9 +321,9 @@ class SimulatedRoom:
             view.touched.append(box)
             kernels.darken_floor(view.scene, view.floor, instant.floor_light, instant.floor_dark, x0, y0, *box)
 
-    def _draw(self, view: _View, instant: _Instant) -> None:
+    def _draw(self, view: _View, everything: tuple[_Lit, ...]) -> None:
         seen = []
-        for lit in instant.lit:
+        for lit in everything:
             uv, depth = view.project(lit.vertices)
             box = _image_box(uv, depth, _NEAR_M, view.camera)
             if box is not None:
