@@ -54,7 +54,7 @@ def test_an_arm_in_the_trunk_shows_nowhere_and_the_pose_is_not_reliable(walking,
     shown = limbs_shown(hull.views, wrong.flesh)
     assert shown[side, :2].min() < 0.01 < 0.03 < shown[1 - side].min()
     depths, right = forearm_depths_m(wrong.flesh), forearm_depths_m(pose.flesh)
-    assert depths[side] > -0.01 > right[side]
+    assert depths[side] > -0.006 > right[side]
     assert depths[1 - side] == right[1 - side]
     assert not wrong.reliable and wrong.risk > 0.9
     assert wrong.doubt == f"the {('left', 'right')[side]} arm hardly shows in the silhouettes"
