@@ -147,6 +147,24 @@ def test_old_frames_are_forgotten():
     assert np.linalg.eigvalsh(memory.known(0.0).information).max() == pytest.approx(SizeMemory.REMEMBERED - 1)
 
 
+@pytest.mark.parametrize(("share", "remembered"), [(0.999, 4), (1.001, 1)])
+def test_a_size_that_a_frame_contradicts_is_forgotten(share, remembered):
+    """When holding on to it cost more than a share of the frame's energy; that frame itself is always remembered."""
+    rng = np.random.default_rng(9)
+    state = figure_poses.random_state(rng)
+    memory = memory_of(*[(state, quadratic(rng, state, state.shape)) for _ in range(3)])
+    frame = quadratic(rng, state, state.shape + 0.2)
+    size = KnownSize(state.shape - rng.normal(0.0, 0.2, len(state.shape)), some_information(rng))
+    scale = share * SizeMemory.CONTRADICTED * frame.cost / size.cost(state.shape)
+    after = memory.after(KnownSize(size.shape, scale * size.information), state, frame)
+    kept = memory if remembered > 1 else SizeMemory.nothing()
+    expected = kept.with_frame(state, frame)
+    assert after.frames == expected.frames == remembered
+    np.testing.assert_array_equal(after.information, expected.information)
+    np.testing.assert_array_equal(after.pull, expected.pull)
+    np.testing.assert_array_equal(after.pointing, expected.pointing)
+
+
 def test_a_frame_that_is_no_number_is_not_remembered():
     state = figure_poses.random_state(np.random.default_rng(8))
     memory = memory_of((state, System(0.0, np.zeros(N), np.eye(N))))

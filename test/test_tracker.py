@@ -6,6 +6,7 @@ from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 
+import figure_poses
 import numpy as np
 import pytest
 from flesh_hulls import moved
@@ -250,8 +251,8 @@ class Stand:
     """Stands in for searches and refinements: hands out figures of the costs that it is told, and counts."""
 
     def __init__(self, monkeypatch):
-        self.scratch_cost, self.costs = 1e-4, {}
-        self.searched, self.refined, self.checked, self.guessed = [], [], [], []
+        self.scratch_cost, self.costs, self.of_size = 1e-4, {}, {}  # what the known size costs besides
+        self.searched, self.refined, self.checked, self.guessed, self.priors = [], [], [], [], []
         self.found, self.cut = set(), set()
         self.frame = 0
         monkeypatch.setattr(tracker, "fit_from_scratch", self.search)
@@ -270,9 +271,10 @@ class Stand:
     def refine(self, state, evidence, weights, iterations, priors=(), known=None):
         if iterations != Tracker.FINAL_STEPS:
             self.refined.append((self.frame, state, iterations))
+        self.priors.append(priors)
         cost = self.costs.get(self.frame, 1e-4)
         settled = FigureState.standing(state.root)
-        return Refined(settled, costing(cost), costing(cost), "iterations")
+        return Refined(settled, costing(cost + self.of_size.get(self.frame, 0.0)), costing(cost), "iterations")
 
     def system(self, state, evidence, weights):
         self.guessed.append((self.frame, state))
@@ -362,6 +364,41 @@ def test_a_doubted_fit_is_searched_anew_but_not_in_every_frame(stand, first, cos
     stand.scratch_cost = (1.01 - Tracker.BETTER) * cost  # hardly better: the figure that was followed stays
     assert stand.run(follower, 29 - first) == [cost] * (29 - first)
     assert stand.search_frames == searched
+
+
+def test_what_the_known_size_costs_makes_no_figure_doubtful(stand):
+    """It is the energy by which figures are told apart: one of another size explains its hull as well."""
+    stand.of_size = dict.fromkeys(range(5, 40), 5e-4)
+    assert Tracker.DOUBTFUL_COST < 5e-4
+    stand.run(Tracker(seed=0), 39)
+    assert stand.search_frames == [1]
+    assert all(len(limbs) == 1 for _, limbs in stand.checked)  # those whose turn it is
+
+
+def test_a_size_is_remembered_by_what_the_hull_says_not_by_what_was_known_before(stand, monkeypatch):
+    told, after = [], SizeMemory.after
+    monkeypatch.setattr(SizeMemory, "after", lambda self, *args: (told.append(args[2].cost), after(self, *args))[1])
+    stand.of_size = {2: 5e-4, 3: 5e-4}
+    stand.run(Tracker(seed=0), 3)
+    assert told == [1e-4, 1e-4]
+
+
+def test_sizes_are_known_by_the_weights_of_which_the_frames_energies_are(stand):
+    weights = tracker.Weights(proportions=3e-7)
+    follower = Tracker(seed=0, weights=weights)
+    stand.run(follower, 2)
+    rng = np.random.default_rng(0)
+    for _ in range(5):  # in one posture all the time the weight would not matter
+        follower._sizes = follower._sizes.with_frame(figure_poses.random_state(rng), costing(1e-4))
+    memory = follower._sizes
+    stand.priors.clear()
+    stand.run(follower, 1)
+    expected, of_others = memory.known(weights.proportions), memory.known(tracker.Weights().proportions)
+    assert np.abs(expected.information - of_others.information).max() > 1e-6
+    assert len(stand.priors) == 2  # carried along, and put in its place
+    for size, *_ in stand.priors:
+        np.testing.assert_array_equal(size.information, expected.information)
+        np.testing.assert_array_equal(size.shape, expected.shape)
 
 
 def test_a_clearly_better_fit_replaces_the_followed_one(stand):
