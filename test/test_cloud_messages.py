@@ -18,13 +18,15 @@ from limbloc_ros.core.engine_robust import outline_rays
 from limbloc_ros.core.errors import InputError
 from limbloc_ros.core.hull import NOBODY, Hull, carve
 from limbloc_ros.core.surface import extract_surface
-from limbloc_ros.ros import messages
+from limbloc_ros.core.views import Views
+from limbloc_ros.ros import _cloud_kernels, messages
 from limbloc_ros.ros.cloud_messages import (
     check_voxel_size,
     cloud_to_hull,
     empty_hull_cloud,
     hull_to_cloud,
     surface_to_cloud,
+    warm_up,
 )
 
 HEADER = messages.make_header(1_700_000_000_123_456_789, "room")
@@ -110,13 +112,18 @@ def test_outline_rays_are_the_same_live_as_offline() -> None:
 
 
 def test_a_hull_of_which_nobody_knows_who_cut_it() -> None:
-    """Neither without `cut_by`, nor where no camera decided, nor where its place is not known."""
+    """Without `cut_by`; where no camera decided, its place is not known, or it decided only outside the shell."""
     hull = ball(0.1, 1.0)
     nobody = np.full(hull.sdf.shape, NOBODY, np.uint8)
     for unknown in (
         hull,
         dataclasses.replace(hull, cut_by=nobody, viewpoints=np.zeros((3, 3), np.float32)),
         dataclasses.replace(hull, cut_by=nobody - 200, viewpoints=np.ones((3, 3), np.float32)),
+        dataclasses.replace(
+            hull,
+            cut_by=np.where(hull.sdf < np.float32(0.06), nobody, 0).astype(np.uint8),
+            viewpoints=np.ones((3, 3), np.float32),
+        ),
     ):
         back = cloud_to_hull(hull_to_cloud(unknown, HEADER))
         assert back is not None
@@ -144,10 +151,44 @@ def test_of_a_small_hull_travels_everything_too() -> None:
     views = carve(ball_masks(rig, [((0.0, 0.0, 1.0), 0.4)]), rig, HullConfig()).views
     assert views is not None
     indices, sdf = np.array([[0, 0, 5], [0, 1, 5]], np.int32), np.array([-0.02, 0.01], np.float32)
-    hull = dataclasses.replace(Hull.from_shell(0.02, 0.06, indices, sdf), views=views)
+    cut_by, viewpoints = np.array([NOBODY, 1], np.uint8), np.array([[0, 0, 0], [2, -1, 1.5]], np.float32)
+    hull = Hull.from_shell(0.02, 0.06, indices, sdf, cut_by=cut_by, viewpoints=viewpoints)
+    hull = dataclasses.replace(hull, views=views)
     back = cloud_to_hull(hull_to_cloud(hull, HEADER))
-    assert back is not None and back.views is not None
+    assert back is not None and back.views is not None and back.cut_by is not None and hull.cut_by is not None
     assert (back.sdf.tobytes(), back.views.packed) == (hull.sdf.tobytes(), views.packed)
+    assert (back.cut_by.tobytes(), back.viewpoints.tobytes()) == (hull.cut_by.tobytes(), viewpoints.tobytes())
+
+
+def extra_of(msg: PointCloud2) -> bytes:
+    return b"".join(bytes(msg.data)[24 * n + 20 : 24 * n + 24] for n in range(msg.width))
+
+
+def test_what_belongs_to_the_hull_as_a_whole_stands_in_its_order_and_nothing_behind_it() -> None:
+    hull = ball(0.1)
+    shell = hull.sdf < np.float32(hull.band_m)
+    viewpoints = np.array([[1.5, -2, 3]], np.float32)
+    hull = dataclasses.replace(hull, cut_by=np.where(shell, 0, NOBODY).astype(np.uint8), viewpoints=viewpoints)
+    lengths = set()
+    for cells in range(20, 200, 10):  # packed they have all remainders by 4
+        camera = np.zeros((1, 35))
+        camera[0, [0, 4, 8]], camera[0, 11:16], camera[0, 31:33] = 1.0, (3.0, 100.0, 100.0, 32.0, 24.0), (64.0, 48.0)
+        pattern = np.random.default_rng(cells).integers(0, 3, cells).astype(np.uint8)
+        views = Views(camera, np.array([[8, 8, cells // 2, 2, 2, 0]]), pattern)
+        lengths.add(len(views.packed) % 4)
+        msg = hull_to_cloud(dataclasses.replace(hull, views=views), HEADER)
+        expected = struct.pack("<4I3f", 100_000, 60_000, 1, len(views.packed), 1.5, -2, 3) + views.packed
+        assert msg.width == np.count_nonzero(shell)
+        assert extra_of(msg) == expected.ljust(4 * msg.width, b"\0")
+        back = cloud_to_hull(msg)
+        assert back is not None and back.views is not None
+        assert back.views.packed == views.packed
+        one = Hull.from_shell(0.02, 0.06, np.array([[0, 0, 5]], np.int32), np.array([-0.02], np.float32))
+        cut = hull_to_cloud(dataclasses.replace(one, views=views), HEADER)
+        cut.width, cut.data = cut.width - 1, cut.data[:-24]  # the last bytes of the views are missing
+        with pytest.raises(InputError, match="cannot hold"):
+            cloud_to_hull(cut)
+    assert lengths == {0, 1, 2, 3}
 
 
 @pytest.mark.parametrize("index", [(-32768, 32767, 0), (32767, -32768, 32767)])
@@ -156,6 +197,48 @@ def test_voxels_far_from_the_origin_are_told_apart(index: tuple[int, int, int]) 
     back = cloud_to_hull(hull_to_cloud(hull, HEADER))
     assert back is not None
     assert back.index_min == hull.index_min
+
+
+@pytest.mark.parametrize(("last", "beyond"), [(32767, 32768), (-32768, -32769)])
+@pytest.mark.parametrize("voxel_m", [0.02, 0.0123])
+def test_voxels_too_far_from_the_origin_are_refused(voxel_m: float, last: int, beyond: int) -> None:
+    msg = hull_to_cloud(
+        Hull.from_shell(voxel_m, 0.06, np.array([[last, 0, 0]], np.int32), np.array([-0.01], np.float32)), HEADER
+    )
+    rows = np.frombuffer(bytes(msg.data), np.float32).reshape(-1, 6).copy()
+    rows[:, 0] = (beyond + 0.5) * voxel_m
+    msg.data = array("B", rows.tobytes())
+    with pytest.raises(InputError, match="not too far away"):
+        cloud_to_hull(msg)
+
+
+def test_points_lie_at_centres_of_voxels_but_for_what_float32_rounds() -> None:
+    here = struct.unpack_from("<f", bytes(damaged().data))[0]
+    hull = cloud_to_hull(overwritten(0, struct.pack("<f", here + 0.0005)))
+    assert hull is not None
+    assert hull.sdf.tobytes() == ball(0.1).sdf.tobytes()
+    for off in (0.002, -0.002):
+        with pytest.raises(InputError, match="centres of voxels"):
+            cloud_to_hull(overwritten(0, struct.pack("<f", here + off)))
+
+
+def test_what_pads_a_row_means_nothing() -> None:
+    hull = cloud_to_hull(overwritten(18, b"\xff\xff", 42, b"\x01\x80"))
+    assert hull is not None
+    assert hull.sdf.tobytes() == ball(0.1).sdf.tobytes()
+
+
+def test_no_hull_has_a_kernel_compiled_once_more_after_warming_up() -> None:
+    warm_up()
+    rig = ring(4)
+    hull = carve(ball_masks(rig, [((0.0, 0.0, 1.0), 0.4)]), rig, HullConfig())
+    assert isinstance(hull, Hull) and hull.cut_by is not None
+    msg = hull_to_cloud(hull, HEADER)
+    for data in (msg.data, array("B", bytes(msg.data))):
+        msg.data = data
+        cloud_to_hull(msg)
+    for kernel in (_cloud_kernels.somebody_cut, _cloud_kernels.write_rows, _cloud_kernels.read_rows):
+        assert len(kernel.signatures) == 1, kernel.__name__
 
 
 def test_an_empty_cloud_is_nobody() -> None:
@@ -193,6 +276,8 @@ def overwritten(*changes: Any) -> PointCloud2:
         (overwritten(8, struct.pack("<f", 3276.85)), "not too far away"),
         (overwritten(12, struct.pack("<f", float("nan"))), "finite"),
         (overwritten(12, struct.pack("<f", 7.0)), "below the band"),
+        (overwritten(12, struct.pack("<f", 0.06)), "below the band"),
+        (overwritten(12, struct.pack("<f", -100.0)), "finite"),
         (overwritten(0, struct.pack("<fff", 3200.05, -3200.05, 3200.05)), "too large"),
         (overwritten(16, struct.pack("<H", 256)), r"up to 255 \(nobody\), got 256"),
         (overwritten(16, struct.pack("<H", 65_535)), "got 65535"),

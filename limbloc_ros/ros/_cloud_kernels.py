@@ -91,7 +91,7 @@ def read_rows(words: Any, numbers: Any, voxel_m: float) -> Any:
     for n in range(count):
         for axis in range(3):
             place = np.float64(numbers[n, axis]) / voxel_m - 0.5
-            if -32769.0 < place < 32768.0:
+            if -32768.5 < place < 32767.5:  # NaN is not
                 index = np.int64(np.floor(place + 0.5))
                 indices[n, axis] = index
                 astray = max(astray, abs(place - index))
