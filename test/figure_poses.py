@@ -25,16 +25,12 @@ def random_state(rng: np.random.Generator, share: float = 1.0) -> FigureState:
 
 @cache
 def fitted_states() -> tuple[FigureState, ...]:
-    """65 postures that the pipeline fitted to benchmark people; see data/make_figure_states.py."""
+    """79 postures that the pipeline fitted to benchmark people; see data/make_figure_states.py."""
     with np.load(Path(__file__).parent / "data" / "figure_states.npz") as file:
         rows = file["states"].astype(np.float64)
     split = 3 + 3 * N_BONES
-    bare = np.zeros(proportions().n_shape - proportions().clothing_from)
     return tuple(
-        FigureState(
-            row[:3], Rotation.from_rotvec(row[3:split].reshape(-1, 3)).as_matrix(), np.concatenate([row[split:], bare])
-        )
-        for row in rows
+        FigureState(row[:3], Rotation.from_rotvec(row[3:split].reshape(-1, 3)).as_matrix(), row[split:]) for row in rows
     )
 
 

@@ -2,6 +2,7 @@
 """The URDFs, read back from their text by a forward kinematics of our own, and the ROS4HRI angles that move them."""
 
 import xml.etree.ElementTree as ET
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -159,15 +160,31 @@ def test_ros4hri_kinematics_keep_the_legs_exactly(random_poses, real_poses):
         assert max(v for joint, v in loss.items() if joint.startswith(("hip", "knee", "ankle"))) < 1e-4
 
 
-def test_ros4hri_kinematics_lose_no_more_than_documented(real_poses):
-    """docs/model.md, "What the projection drops"."""
+def documented_losses() -> dict[str, list[float]]:
+    """The rows of docs/model.md, "What the projection drops": median, 95 %, worst, mm."""
+    text = (Path(__file__).parents[1] / "docs" / "model.md").read_text()
+    lines = text[text.index("### What the projection drops") :].splitlines()
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("|")]
+    return {what: [float(value) for value in values] for what, *values in rows[2:]}
+
+
+def test_ros4hri_kinematics_lose_what_is_documented(real_poses):
     found = [losses(pose, ros4hri(pose)) for pose in real_poses]
-    table = {joint: np.array([row[joint] for row in found]) for joint in LINK_OF_JOINT}
-    for joint, values in table.items():
-        median, worst = (0.030, 0.065) if joint in ("neck_base", "head_centre") else (0.025, 0.065)
-        assert np.median(values) < median, joint
-        assert values.max() < worst, joint
-    wrists, shoulders = (np.r_[table[f"{joint}_L"], table[f"{joint}_R"]].mean() for joint in ("wrist", "shoulder"))
+    table = documented_losses()
+    assert len(table) == 6
+    for what, documented in table.items():
+        names = tuple(name.strip().removesuffix("s").replace(" ", "_") for name in what.split(","))
+        values = 1000 * np.array([row[joint] for row in found for joint in row if joint.startswith(names)])
+        assert len(values) >= len(found), what
+        actual = [np.median(values), np.percentile(values, 95), values.max()]
+        np.testing.assert_allclose(actual, documented, rtol=0.04, atol=0.1, err_msg=what)  # they are rounded
+
+
+def test_wrists_make_good_a_part_of_what_shoulders_lose(real_poses):
+    found = [losses(pose, ros4hri(pose)) for pose in real_poses]
+    wrists, shoulders = (
+        np.mean([row[f"{joint}_{side}"] for row in found for side in "LR"]) for joint in ("wrist", "shoulder")
+    )
     assert wrists < 0.75 * shoulders
 
 
