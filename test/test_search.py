@@ -162,6 +162,16 @@ def test_hypotheses_differ_and_are_the_same_every_time(person):
             assert np.linalg.norm(a.root - b.root) >= 0.08 or max(side, axis) >= 0.4
 
 
+def torso_score(grid, points, radii, clip):
+    """How badly spheres [S, 3] of a torso match the hull: 0 perfect, 1 a complete miss."""
+    table = search._torso_table()
+    phi = np.array([kernels.depth_at(*grid, *point) for point in points])
+    off = phi + radii
+    solid = np.where(off > 0, 1.5 * off, off)
+    missed = np.where(np.arange(len(points)) < table.n_solid, solid, np.maximum(0.0, radii - phi))
+    return np.average(np.clip(missed, -clip, clip) ** 2, weights=table.weights) / clip**2
+
+
 def torsos_one_by_one(person, pelvis, skull, headings):
     """All torsos [N, 14] between seeds, each placed and scored by itself."""
     hull, table = person.hull, search._torso_table()
@@ -185,7 +195,7 @@ def torsos_one_by_one(person, pelvis, skull, headings):
                     [a - stature * R @ base, figure.kernels.log_so3(R), bend, np.zeros(3), [np.log(stature)]]
                 )
                 spheres = search.torso_kernels.place_torso(pose, *table.arrays)
-                score = search.torso_kernels.torso_score(*grid, *spheres, table.weights, table.n_solid, 0.04 * stature)
+                score = torso_score(grid, *spheres, 0.04 * stature)
                 rows.append([*pose, score])
     return np.array(rows)
 
@@ -245,7 +255,7 @@ def test_climbing_torsos_against_all_steps_in_full(person):
             trial[list(active)] += (draw * spread * (1 - 0.8 * step / 60))[list(active)]
             spheres = torso_kernels.place_torso(trial, *table.arrays)
             clip = 0.04 * np.exp(trial[12])
-            trial[13] = torso_kernels.torso_score(*grid, *spheres, table.weights, table.n_solid, clip)
+            trial[13] = torso_score(grid, *spheres, clip)
             bend, turn = (trial[6:9] ** 2).sum(), (trial[9:12] ** 2).sum()
             trial[13] += 0.01 * (bend + turn) + 0.3 * (max(0.0, bend - 1.2) + max(0.0, turn - 0.8))
             if trial[13] < best[13]:

@@ -24,7 +24,12 @@ _ONE, _TWO = np.uint32(1), np.uint32(2)
 
 @njit(cache=True, inline="always", error_model="numpy")  # type: ignore[misc, unused-ignore]
 def misfit(phi: float, radius: float, solid: bool, clip: float) -> float:
-    """Clipped square of how badly a sphere matches at whose centre the signed distance is phi; see `torso_score`."""
+    """Clipped square of how badly a sphere of a torso matches the hull at whose centre the signed distance is phi.
+
+    A solid sphere, which should just fit, misses by phi + radius (half as much again when it sticks out), an empty one
+    by radius - phi while that is positive. A torso's score is the weighted mean over clip^2, so 0 is perfect and
+    1 a complete miss.
+    """
     if solid:
         e = phi + radius
         if e > 0.0:
@@ -33,22 +38,6 @@ def misfit(phi: float, radius: float, solid: bool, clip: float) -> float:
         e = max(0.0, radius - phi)
     e = min(max(e, -clip), clip)
     return e * e
-
-
-@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
-def torso_score(
-    sdf: Any, origin: Any, voxel: float, points: Any, radii: Any, weights: Any, n_solid: int, clip: float
-) -> float:
-    """How badly torso spheres match the hull: the first n_solid should just fit, the others must be empty.
-
-    A solid sphere misses by phi + radius (sticking out counts double), an empty one by how deep its centre lies
-    below its radius outside. Mean of clipped squares over clip^2, so 0 is perfect and 1 a complete miss.
-    """
-    total = 0.0
-    for n in range(len(points)):
-        phi = depth_at(sdf, origin, voxel, points[n, 0], points[n, 1], points[n, 2])
-        total += weights[n] * misfit(phi, radii[n], n < n_solid, clip)
-    return total / (weights.sum() * clip * clip)  # type: ignore[no-any-return]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[misc, unused-ignore]
