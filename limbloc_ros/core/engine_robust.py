@@ -85,6 +85,8 @@ class Effort:
     dressed: bool = False
 
 
+#: Points and steps of the last refinement of a frame alone.
+POLISH_POINTS, POLISH_STEPS = 2500, 4
 #: While the figure is searched, residuals are believed from further off, it is held in the hull more firmly, and nobody
 #: wears loose clothes: with the final weights too many wrong figures explain a hull; these make limbs a little short.
 SEARCH_WEIGHTS = {"inclusion": 0.006, "surface_width_m": 0.06, "clothing": 1e-2}
@@ -147,13 +149,17 @@ class Fit:
 def gather_evidence(
     hull: Hull, surface: Surface, points: int, rng: np.random.Generator, themselves_every: int = 4
 ) -> Evidence:
-    """A random but even sample of the surface, and the signed distance grid.
+    """An even sample of the surface, every so-many-th point from a random one on, and the signed distance grid.
+
+    Points come in the order of the grid, so that neighbours are taken in turn: by such a sample joints shake a tenth
+    less from frame to frame than by points taken at random.
 
     The hull holds more than the body, the more so the fewer cameras there are; its surface there is phantom. But each
     of its points lies on a viewing ray along the outline of some silhouette, and that ray touches the body. So every
     `themselves_every`-th point asks to be explained itself, which leads from far off, the others that their ray be.
     """
-    rows = np.sort(rng.permutation(len(surface))[:points])
+    count = min(points, len(surface))
+    rows = ((np.arange(count) + rng.random()) * (len(surface) / count)).astype(np.int64)
     rays = outline_rays(hull, surface, rows)
     rays[::themselves_every] = 0.0
     weights = np.full(len(rows), 1.0 / len(rows))
@@ -347,7 +353,14 @@ def fit_from_scratch(
             if better is best:
                 break
             best = better
-    return best
+    return None if best is None else _polished(best, hull, surface, seed, weights or Weights())
+
+
+def _polished(fit: Fit, hull: Hull, surface: Surface, seed: int, weights: Weights) -> Fit:
+    """The fit on more points: the search does not need that many, but joints lie the better the more there are."""
+    evidence = gather_evidence(hull, surface, POLISH_POINTS, np.random.default_rng(seed))
+    found = refine(fit.state, evidence, weights, POLISH_STEPS)
+    return replace(fit, state=found.state, system=found.system)
 
 
 def _with_other_limbs(best: Fit, scene: Scene, effort: Effort) -> Fit:
