@@ -144,7 +144,7 @@ class Tracker:
             size = self._sizes.known(self._weights.proportions)
             steps = self.STEPS if np.abs(moved).max() < 0.1 else self.FAR_STEPS
             result = refine(guesses[best], evidence, self._firm, steps, (size,), systems[best])
-            if not cut and not (self._hopeless(result.system.cost) and self._search_is_due(cut)):
+            if not cut and not (self._hopeless(result.energy.cost) and self._search_is_due(cut)):
                 result = self._with_limbs_checked(result, hull, surface, evidence, size)
             judged = result.energy.cost
             inertia = Inertia(self._expected_joints(self._last, moved), self.INERTIA, self.INERTIA_WIDTH_M)
