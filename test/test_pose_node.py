@@ -297,7 +297,7 @@ def test_tf_posture_and_the_list_of_bodies_where_they_exist(
     graph: Graph, hull: Hull, offline: Pose, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sent: list[Any] = []
-    output = types.SimpleNamespace(available=True, send=sent.extend)
+    output = types.SimpleNamespace(available=True, wanted=True, send=sent.extend)
     monkeypatch.setattr(body_output, "TransformOutput", lambda node: output)
     node = graph.add(PoseNode)
     tracked: list[IdsList] = []

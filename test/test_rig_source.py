@@ -117,7 +117,10 @@ def test_transforms_are_heard_from_all_who_tell_of_them(graph: Graph, message: A
     first.send([transform("ceiling", "rail", pose(x=1.0))])  # both are kept for late joiners
     second = TransformOutput(graph.tester, static=True)
     second.send([transform("rail", "cam0", pose(y=0.5, turn=90.0))])
+    moves = TransformOutput(graph.tester)
+    assert (moves.wanted, second.wanted) == (False, True)  # nobody listens yet: what never moves is kept for them
     heard = TransformListener(graph.add(lambda **options: Node("listener", **options)))
+    graph.until(lambda: moves.wanted)
 
     def known() -> bool:
         try:

@@ -192,3 +192,38 @@ def copy_where(grid: Any, corner: Any, kept: Any, otherwise: Any) -> Any:
             for k in range(kept.shape[2]):
                 new[k] = row[k] if stays[k] else otherwise
     return out
+
+
+@njit(cache=True, nogil=True)
+def inside_cells(sdf: Any, most: int) -> tuple[Any, Any, int]:
+    """Some of the cells below 0, and what their mean needs.
+
+    Returns int64 [M, 3] every so-many-th of them in the order of the grid, all of them or `most` to 2 `most`; the sum
+    of all of them, int64 [3]; how many there are.
+    """
+    count = 0
+    total = np.zeros(3, np.int64)
+    for i in range(sdf.shape[0]):
+        for j in range(sdf.shape[1]):
+            line = sdf[i, j]
+            here: Any = 0
+            for k in range(len(line)):
+                if line[k] < 0.0:
+                    here += 1
+                    total[2] += k
+            count += here
+            total[0] += here * i
+            total[1] += here * j
+    every = max(1, count // most)
+    cells = np.empty(((count + every - 1) // every, 3), np.int64)
+    n = 0
+    for i in range(sdf.shape[0]):
+        for j in range(sdf.shape[1]):
+            line = sdf[i, j]
+            for k in range(len(line)):
+                if line[k] < 0.0:
+                    if n % every == 0:
+                        at = cells[n // every]
+                        at[0], at[1], at[2] = i, j, k
+                    n += 1
+    return cells, total, count

@@ -55,6 +55,8 @@ LEAST_SHOWN = 0.003
 #: Error that remains where nothing is in doubt, m; how far the energy's curvature is believed; by how much the energy
 #: of a rival (as a fraction of the least) may be above that before it hardly counts.
 FLOOR_M, BELIEF, RIVAL_WIDTH = 0.008, 0.015, 0.08
+_STICKS = np.array([(JOINT[a], JOINT[b]) for a, b in STICK_BONES])
+_STICK_NAMES = [f"{a}-{b}" for a, b in STICK_BONES]
 
 
 def joint_sigma(state: FigureState, system: System, rivals: Rivals = ()) -> Array:
@@ -196,7 +198,8 @@ def describe_pose(
     known = judge.judge(state)
     joints, risk, sign = known.placed.joints, known.risk, known.sign
     sigma = joint_sigma(state, system, rivals) if system is not None else np.full(len(JOINT_NAMES), 0.05)
-    sizes = {f"{a}-{b}": float(np.linalg.norm(joints[JOINT[a]] - joints[JOINT[b]])) for a, b in STICK_BONES}
+    sticks = joints[_STICKS[:, 0]] - joints[_STICKS[:, 1]]
+    sizes = dict(zip(_STICK_NAMES, np.linalg.norm(sticks, axis=1).tolist(), strict=True))
     sizes["stature"] = float(np.exp(state.shape[0]))
     if risk == 0.0 and system is not None and system.cost >= NO_MATCH_COST:
         risk, sign = 1.0, "the figure does not match the hull's surface, and what the cameras saw is not known"

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from limbloc_ros.core._component_kernels import inside_cells
 from limbloc_ros.core._nearest_kernels import nearest_distances
 from limbloc_ros.core.errors import NoPerson
 from limbloc_ros.core.hull import NOBODY, Hull, components, largest_component
@@ -43,9 +44,11 @@ class Part:
     @staticmethod
     def of(hull: Hull) -> Part:
         """What is to be known of a hull in one part."""
-        local = np.stack(np.nonzero(hull.sdf < 0), axis=1)
-        centres = (local + np.asarray(hull.index_min) + 0.5) * hull.voxel_m
-        return Part(centres[:: max(1, len(local) // POINTS)], centres.mean(axis=0), len(local) * hull.voxel_m**3)
+        some, total, count = inside_cells(hull.sdf, POINTS)
+        points, centre = (
+            (cells + np.asarray(hull.index_min) + 0.5) * hull.voxel_m for cells in (some, total / max(count, 1))
+        )
+        return Part(points, centre, count * hull.voxel_m**3)
 
     def filling(self) -> Flesh:
         """It as balls, one around each of the points."""
@@ -103,6 +106,7 @@ def nearest(points: Array, query: Array) -> Array:
 @functools.cache  # once per process
 def warm_up() -> None:
     """Compile or load the kernels, so that the first frame is not slow."""
+    inside_cells(np.zeros((1, 1, 1), np.float32), 1)
     nearest(np.zeros((1, 3)), np.zeros((1, 3)))
 
 

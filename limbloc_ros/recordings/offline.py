@@ -33,7 +33,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from limbloc_ros import __version__
-from limbloc_ros.core import background
+from limbloc_ros.core import background, parts
 from limbloc_ros.core.camera import Rig
 from limbloc_ros.core.config import BackgroundConfig, FitConfig, HullConfig, SyncConfig
 from limbloc_ros.core.errors import InputError, Interrupted, NoPerson
@@ -155,6 +155,7 @@ def prepare(say: Callable[[str], None] = lambda text: None) -> None:
     try:
         background.warm_up()
         PoseEstimator.warm_up()
+        parts.warm_up()
     finally:
         patience.cancel()
 

@@ -135,7 +135,7 @@ class BodyOutput:
         self._states.publish(states)
         if self._body_posture is not None:
             self._posture.publish(self._body_posture(header=header, posture=POSTURES.index(posture_of(pose.joints))))
-        if self._transforms is not None and self._transforms.available:
+        if self._transforms is not None and self._transforms.wanted:
             frames = [transform_to_message(body_pose(pose), topics.body_frame(self._id), header)]
             if self._publish_tf == "all":
                 frames += link_transforms(

@@ -144,6 +144,11 @@ class TransformOutput:
         """Whether there is TF."""
         return self._message is not None
 
+    @property
+    def wanted(self) -> bool:
+        """Whether somebody listens; those who come later are told what never moves, and the next of what does."""
+        return self._message is not None and (self._static is not None or self._publisher.get_subscription_count() > 0)
+
     def send(self, transforms: Sequence[TransformStamped]) -> None:
         """Broadcast some transforms; static ones together with all sent before, since only the last message is kept."""
         if self._message is None:
