@@ -80,9 +80,9 @@ class Tracker:
     #: Then a limb that settles where it was counts as well: it may have come back along a better way.
     LIMB_DOUBT, MORE_STEPS, LONGEST_DOUBT = 1.25, 10, 8
     #: The figure is carried along by so many steps, or by more when it has moved by 10 cm, with the firm weights of
-    #: the search, which lead from further off; so many more with the final ones put its joints in their places. (With 5
-    #: and 4, or 8 and 4, a wrist is 10 to 18 cm off in 4 and 8 of 1320 frames, with these in none; with limbs checked
-    #: in every third frame wrists of raised arms stay as far behind in rough hulls.)
+    #: the search, which lead from further off; so many more with the final ones put its joints in their places. (With 4
+    #: of these a wrist was 10 to 18 cm off in 8 of 1320 frames, with 6 in none; with limbs checked in every third frame
+    #: wrists of raised arms stay as far behind in rough hulls.)
     STEPS, FAR_STEPS, FINAL_STEPS = 5, 20, 6
     #: A limb that settled elsewhere is first carried on by so many steps, and given up when the energy is then so many
     #: times what it was: of those that win in the end, 1.18 times at most.
