@@ -123,13 +123,14 @@ def least_work(chain: Chain, evaluations: float) -> dict[str, tuple[float, float
     state = FigureState.standing(np.zeros(3))  # how many parameters move a sphere does not depend on the pose
     moved = figure.place_jacobian(state)[: figure.N_SPHERES].any(axis=1).sum(axis=1).astype(float)
     parameters = 3 + figure.N_DOF + len(state.shape)
-    evaluation = Tracker.POINTS * 190 + float((3 * 32 * moved + 4 * moved**2).sum()) + parameters**3 / 3
+    points_asked = 0.5 * (Tracker.POINTS + Tracker.FINAL_POINTS)  # about half of the evaluations each
+    evaluation = points_asked * 190 + float((3 * 32 * moved + 4 * moved**2).sum()) + parameters**3 / 3
     return {
         "background": (sum(4.0 * full + 12.0 * small for full, small in zip(pixels, working, strict=True)),
                        20.0 * sum(working)),
         "carve": (sum(pixels) + 8.0 * near + 4.0 * len(shell), 10.0 * near + 35.0 * len(shell) * len(cameras)),
         "surface": (4.0 * len(shell) + 60.0 * points, 220.0 * points),
-        "fit": (4.0 * len(shell) + 80.0 * Tracker.POINTS, evaluations * evaluation),
+        "fit": (4.0 * len(shell) + 80.0 * (Tracker.POINTS + Tracker.FINAL_POINTS), evaluations * evaluation),
         "describe": (4.0 * len(shell), parameters**3 / 3 + 2.0 * 75 * parameters**2),
     }  # fmt: skip
 

@@ -188,6 +188,22 @@ def test_a_polished_figure_explains_the_whole_surface_better(monkeypatch):
     assert costs[1] < 0.99 * costs[0]
 
 
+def test_what_an_earlier_search_found_is_polished_when_a_later_one_finds_no_torso(monkeypatch):
+    hull = hull_of(*PEOPLE[0])
+    surface = extract_surface(hull)
+    first = replace(engine_robust.QUICK, torsos=1, leg_pairs=1, starts=1, enough=0.0)
+    second = replace(first, torso_search=replace(first.torso_search, listed=first.torso_search.listed + 1))
+    found = engine_robust._torsos
+
+    def torsos(hull, medial, seed, effort):
+        return found(hull, medial, seed, effort) if effort == first.torso_search else []
+
+    monkeypatch.setattr(engine_robust, "_torsos", torsos)
+    alone = fit_from_scratch(hull, surface, 0, None, (first,))
+    both = fit_from_scratch(hull, surface, 0, None, (first, second))
+    np.testing.assert_array_equal(both.state.to_vector(), alone.state.to_vector())
+
+
 def test_evidence_is_a_fair_sample():
     hull = hull_of(*PEOPLE[0])
     surface = extract_surface(hull)
@@ -196,7 +212,10 @@ def test_evidence_is_a_fair_sample():
     assert evidence.point_weights.sum() == pytest.approx(1)
     rows = {tuple(point) for point in surface.points}
     assert len({tuple(point) for point in evidence.points} & rows) == 350  # no point twice
-    assert np.linalg.norm(evidence.points.mean(axis=0) - surface.points.mean(axis=0)) < 0.1
+    assert np.linalg.norm(evidence.points.mean(axis=0) - surface.points.mean(axis=0)) < 0.03
+    place_of = {tuple(point): row for row, point in enumerate(surface.points)}
+    gaps = np.diff([place_of[tuple(point)] for point in evidence.points])
+    assert set(gaps) <= {len(surface) // 350, len(surface) // 350 + 1}  # evenly
     every = gather_evidence(hull, surface, 10**9, np.random.default_rng(0))
     np.testing.assert_array_equal(every.points, surface.points)
     # some points ask for themselves, the others for their ray only

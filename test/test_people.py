@@ -6,6 +6,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -239,6 +240,22 @@ def test_a_number_is_kept_for_a_while_and_then_free_again() -> None:
         where = film.show(at(-1, 0), at(0, 1))
     assert where == {first: (-1, 0), second: (0, 1)}
     assert film.bodies[0].number == first  # who has been there longest
+
+
+def test_who_stood_in_the_doorway_is_not_who_comes_in_later(monkeypatch: pytest.MonkeyPatch) -> None:
+    resets = []
+    monkeypatch.setattr(PoseEstimator, "reset", lambda estimator: resets.append(estimator))
+    film = Film(temporal=True)
+    part, pose = at(0, 0)
+    half: Any = NoPerson("somebody is half outside of the carve volume")
+    film.show((part, half))
+    film.show((part, half), skip_s=FORGET_S - 0.5)
+    assert not resets
+    film.show((part, half), skip_s=FORGET_S + 0.5)
+    assert len(resets) == 1
+    film.show((part, pose))
+    film.show((part, pose), skip_s=FORGET_S + 0.5)  # who had a figure keeps it
+    assert len(resets) == 1
 
 
 def test_the_only_person_of_a_room_is_always_the_first() -> None:

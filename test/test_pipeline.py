@@ -288,3 +288,5 @@ def test_half_a_person_at_the_wall_of_the_volume_is_not_reliable():
     assert half.cut_area_m2 > 0.1
     found = PoseEstimator().estimate(half)
     assert isinstance(found, NoPerson) or not found.reliable
+    coming_in = PoseEstimator(FitConfig(temporal=True)).estimate(half)
+    assert coming_in == NoPerson("somebody is half outside of the carve volume")

@@ -297,7 +297,7 @@ def test_tf_posture_and_the_list_of_bodies_where_they_exist(
     graph: Graph, hull: Hull, offline: Pose, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sent: list[Any] = []
-    output = types.SimpleNamespace(available=True, wanted=True, send=sent.extend)
+    output = types.SimpleNamespace(available=True, wanted=True, send=sent.extend)  # somebody listens
     monkeypatch.setattr(body_output, "TransformOutput", lambda node: output)
     node = graph.add(PoseNode)
     tracked: list[IdsList] = []
@@ -323,6 +323,13 @@ def test_tf_posture_and_the_list_of_bodies_where_they_exist(
     children = {joint.find("child").attrib["link"] for joint in ET.fromstring(descriptions[0].data).iter("joint")}
     assert {link.child_frame_id for link in links} == children
     assert all(stamp_ns(link.header) == T0_NS for link in sent)
+    sent.clear()
+    output.wanted = False
+    states = graph.collect(JointState, "humans/bodies/p1/joint_states")
+    node.estimator.estimate = lambda *_: offline
+    carvings.send(hull, 2)
+    graph.until(lambda: len(states) == 1)
+    assert not sent
 
 
 # --- the whole graph ---

@@ -145,7 +145,7 @@ def test_torso_hypotheses_contain_the_true_torso(person):
     assert min(gaps) < 0.07  # left and right where they belong: the better facing
     best = place(found[0][0]).origins[bones[:3]]
     off = np.linalg.norm(best - person.placed.origins[bones[:3]], axis=1)
-    assert (off < [0.12, 0.06, 0.035]).all()  # a torso that is too short hangs from the head
+    assert (off < [0.15, 0.06, 0.04]).all()  # a torso that is too short hangs from the head
     assert np.exp(found[0][0].shape[0]) == pytest.approx(1.7, rel=0.25)  # the legs will tell more
 
 

@@ -136,6 +136,33 @@ def test_no_further_limb_is_looked_for_when_the_energy_is_bearable_again(monkeyp
         assert asked == expected
 
 
+@pytest.mark.parametrize(("ratio", "steps"), [(1.01, 2), (0.99, 3)])
+def test_a_limb_of_far_too_high_an_energy_is_given_up_after_some_steps(monkeypatch, ratio, steps):
+    here, there = FigureState.standing([0.0, 0.0, 1.0]), FigureState.standing([0.06, 0.0, 1.0])
+    monkeypatch.setattr(tracker, "make_scene", lambda *args: SimpleNamespace(quick=None, lenient=None))
+    monkeypatch.setattr(tracker.Medial, "of", lambda hull: None)
+    monkeypatch.setattr(tracker, "unseen", lambda state, hull: 0.0)
+    monkeypatch.setattr(tracker, "with_one_limb", lambda *args: [there])
+    asked = []
+
+    def refine(state, evidence, weights, iterations, *others):
+        asked.append(iterations)
+        cost = ratio * Tracker.GIVEN_UP * 2e-4 if len(asked) == 2 else 1e-4
+        return Refined(there, costing(cost), costing(cost), "iterations")
+
+    monkeypatch.setattr(tracker, "refine", refine)
+    followed = Refined(here, costing(2e-4), costing(2e-4), "converged")
+    found = Tracker(seed=0)._check_limbs([(ARM, "L")], 1, followed, None, None, None, None, 0.0, 0.0)
+    assert len(asked) == steps
+    assert asked[1] == Tracker.FIRST_STEPS
+    assert (found is followed) == (ratio > 1)
+
+
+def test_what_is_published_is_refined_on_more_points(stand):
+    stand.run(Tracker(seed=0), 2)
+    assert stand.points == [(Tracker.STEPS, Tracker.POINTS), (Tracker.FINAL_STEPS, Tracker.FINAL_POINTS)]
+
+
 def test_inertia_steadies_the_joints(monkeypatch):
     frames = range(20, 36)
     truth = np.array([truth_of(frame) for frame in frames])
@@ -253,7 +280,7 @@ class Stand:
     def __init__(self, monkeypatch):
         self.scratch_cost, self.costs, self.of_size = 1e-4, {}, {}  # what the known size costs besides
         self.searched, self.refined, self.checked, self.guessed, self.priors = [], [], [], [], []
-        self.found, self.cut = set(), set()
+        self.found, self.cut, self.points = set(), set(), []
         self.frame = 0
         monkeypatch.setattr(tracker, "fit_from_scratch", self.search)
         monkeypatch.setattr(tracker, "refine", self.refine)
@@ -269,6 +296,7 @@ class Stand:
         return Fit(FigureState.standing([0.0, 0.0, 1.0]), costing(self.scratch_cost), judged=self.scratch_cost)
 
     def refine(self, state, evidence, weights, iterations, priors=(), known=None):
+        self.points.append((iterations, evidence.args[2]))
         if iterations != Tracker.FINAL_STEPS:
             self.refined.append((self.frame, state, iterations))
         self.priors.append(priors)
@@ -458,6 +486,17 @@ def test_who_stays_in_the_doorway_is_searched_quickly_and_again_when_whole(stand
     assert [cost is None for cost in costs] == [True] * long + [False] * 6
     searched = [(frame, len(searches)) for frame, *_, searches in stand.searched]
     assert searched == [(long + 1, 1), (long + 5, 1), (long + 6, 1)]
+
+
+def test_who_was_followed_while_half_outside_is_searched_harder_when_whole(stand):
+    """Coming in means that there was nobody before."""
+    follower = Tracker(seed=0)
+    stand.run(follower, 4)
+    stand.costs, stand.cut = dict.fromkeys(range(5, 40), 10e-4), set(range(5, 12))
+    stand.scratch_cost = 10e-4  # in vain
+    stand.run(follower, 26)
+    searched = [(frame, len(searches)) for frame, *_, searches in stand.searched]
+    assert searched == [(1, 3), (9, 1), (12, 2)]
 
 
 def test_who_is_followed_out_of_the_room_stays_followed(stand):

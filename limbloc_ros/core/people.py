@@ -255,6 +255,8 @@ class People:
         track = self._tracks[0]
         if track.absent_s(stamp_ns) > FORGET_S:
             track.number, track.score = 0, 0
+            if track.state is None:  # who stood in the doorway is not who comes in now
+                track.estimator.reset()
         if not track.number:
             self._alone = track
         track.see(sight.parts[0], stamp_ns, shared=False)

@@ -111,8 +111,9 @@ class PoseEstimator:
             fit = engine_robust.fit_from_scratch(hull, surface, self.config.seed, risk_of=risk_of)
         clock.lap("fit")
         if fit is None:
-            outside = "" if hull.cut_area_m2 < Tracker.HALF_M2 else ": somebody is half outside of the carve volume"
-            return NoPerson(f"the hull holds nothing that a torso fits into{outside}")
+            if hull.cut_area_m2 >= Tracker.HALF_M2:
+                return NoPerson("somebody is half outside of the carve volume")
+            return NoPerson("the hull holds nothing that a torso fits into")
         pose = describe_pose(fit.state, judge, fit.system, clock.stage_ms, fit.rivals)
         return self._wariness.judge(pose) if self.config.temporal else pose
 

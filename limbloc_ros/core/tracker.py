@@ -58,10 +58,10 @@ class Tracker:
     #: several figures explain a ragged hull nearly equally well, each search ends with another one.
     BETTER = 0.3
     #: A hull that the walls of the carve volume cut by so much, m^2 (an arm is a hundredth), is half a person in the
-    #: doorway: whoever comes in is searched when wholly there, or after so many frames; both quickly.
+    #: doorway: whoever comes into an empty room is searched when wholly there, or after so many frames; both quickly.
     HALF_M2, DOORWAY = 0.10, 10
     #: What is searched when starting anew: less than for a frame alone, for the next frames can mend it. All that there
-    #: is only for somebody who was not followed yet and whose figure is doubtful.
+    #: is only for somebody who was neither followed yet nor seen coming in, and whose figure is doubtful.
     SEARCHES = (
         QUICK,
         Effort(
@@ -94,7 +94,7 @@ class Tracker:
     #: carries limbs beyond their places when they stop; three times the weight leaves turning people behind.)
     PACE, INERTIA, INERTIA_WIDTH_M = 0.5, 0.03, 0.03
     #: Surface points that a figure is carried along on, and those of the final refinement: with 700 for both, joints
-    #: are 6 % further off and shake half as much again.
+    #: are 4 % further off and shake a third more.
     POINTS, FINAL_POINTS = 500, 1400
 
     def __init__(self, seed: int, weights: Weights | None = None, searches: Sequence[Effort] = SEARCHES) -> None:
@@ -128,7 +128,7 @@ class Tracker:
         """
         self._frame += 1
         cut = hull.cut_area_m2 >= self.HALF_M2
-        came_in = self._in_doorway > 0 and not cut
+        came_in = self._last is None and self._in_doorway > 0 and not cut
         self._in_doorway = self._in_doorway + 1 if cut else 0
         if self._last is None and 0 < self._in_doorway <= self.DOORWAY:
             return None
@@ -251,7 +251,7 @@ class Tracker:
     ) -> Refined:
         """The figure, or it with one of these limbs after the other elsewhere, but for those that settle near it.
 
-        No further limb is looked for once the energy is bearable again.
+        No further limb is looked for once one elsewhere has made the energy bearable.
         """
         scene = make_scene(hull, Medial.of(hull), surface, self._seed, self._weights, QUICK)
         missed = unseen(result.state, hull)
