@@ -171,6 +171,13 @@ def test_a_frame_that_is_no_number_is_not_remembered():
     assert memory.with_frame(state, System(0.0, np.full(N, np.nan), np.eye(N))) is memory
 
 
+def test_of_no_frame_nothing_is_known():
+    """As after a first frame that was no number."""
+    nothing = SizeMemory.nothing().known(2e-6)
+    assert not nothing.information.any()
+    assert np.isfinite(nothing.shape).all()
+
+
 def test_how_people_differ_counts_once_for_all_postures():
     """The energy of each frame holds it; of frames in many postures most of these are taken away again."""
     rng = np.random.default_rng(7)

@@ -139,7 +139,7 @@ class SizeMemory:
         information = self.information - surplus * np.diag(once) + 1e-12 * np.eye(len(once))
         pull = self.pull - surplus * once * _mean_shape()
         shape = np.asarray(np.linalg.solve(information, pull), np.float64)
-        return KnownSize(shape, (self.frames - 1) * information)
+        return KnownSize(shape, max(self.frames - 1, 0) * information)
 
 
 def _of_the_shape(shape: Array, system: System) -> tuple[Array, Array]:
