@@ -93,6 +93,14 @@ def test_a_wrong_size_is_given_up():
     assert max(errors(follow(follower, 33), 33)) < 0.1
 
 
+@pytest.fixture
+def sightless(monkeypatch):
+    """Limbs are checked without a hull."""
+    monkeypatch.setattr(tracker, "make_scene", lambda *args: SimpleNamespace(quick=None, lenient=None))
+    monkeypatch.setattr(tracker.Medial, "of", lambda hull: None)
+    monkeypatch.setattr(tracker, "unseen", lambda state, hull: 0.0)
+
+
 @pytest.mark.parametrize(
     ("jump_m", "cost", "gain", "believed"),
     [
@@ -105,14 +113,11 @@ def test_a_wrong_size_is_given_up():
     ],
 )
 def test_a_limb_must_explain_the_more_the_further_it_jumps_and_the_worse_the_hull_is(
-    monkeypatch, jump_m, cost, gain, believed
+    monkeypatch, sightless, jump_m, cost, gain, believed
 ):
     here = FigureState.standing([0.0, 0.0, 1.0])
     there = FigureState.standing([jump_m, 0.0, 1.0])
-    monkeypatch.setattr(tracker, "make_scene", lambda *args: SimpleNamespace(quick=None, lenient=None))
-    monkeypatch.setattr(tracker.Medial, "of", lambda hull: None)
     monkeypatch.setattr(tracker, "with_one_limb", lambda *args: [there])
-    monkeypatch.setattr(tracker, "unseen", lambda state, hull: 0.0)
     found = SimpleNamespace(state=there, system=costing((1.0 - gain) * cost), energy=costing(cost))
     monkeypatch.setattr(tracker, "refine", lambda *args: found)
     followed = SimpleNamespace(state=here, system=costing(cost))
@@ -120,11 +125,8 @@ def test_a_limb_must_explain_the_more_the_further_it_jumps_and_the_worse_the_hul
     assert (checked is found) == believed
 
 
-def test_no_further_limb_is_looked_for_when_the_energy_is_bearable_again(monkeypatch):
+def test_no_further_limb_is_looked_for_when_the_energy_is_bearable_again(monkeypatch, sightless):
     here, there = FigureState.standing([0.0, 0.0, 1.0]), FigureState.standing([0.06, 0.0, 1.0])
-    monkeypatch.setattr(tracker, "make_scene", lambda *args: SimpleNamespace(quick=None, lenient=None))
-    monkeypatch.setattr(tracker.Medial, "of", lambda hull: None)
-    monkeypatch.setattr(tracker, "unseen", lambda state, hull: 0.0)
     monkeypatch.setattr(tracker, "refine", lambda *args: Refined(there, costing(1e-4), costing(1e-4), "converged"))
     for bearable, expected in ((1.01e-4, ["L"]), (0.99e-4, ["L", "R"])):
         asked = []
@@ -137,11 +139,8 @@ def test_no_further_limb_is_looked_for_when_the_energy_is_bearable_again(monkeyp
 
 
 @pytest.mark.parametrize(("ratio", "steps"), [(1.01, 2), (0.99, 3)])
-def test_a_limb_of_far_too_high_an_energy_is_given_up_after_some_steps(monkeypatch, ratio, steps):
+def test_a_limb_of_far_too_high_an_energy_is_given_up_after_some_steps(monkeypatch, sightless, ratio, steps):
     here, there = FigureState.standing([0.0, 0.0, 1.0]), FigureState.standing([0.06, 0.0, 1.0])
-    monkeypatch.setattr(tracker, "make_scene", lambda *args: SimpleNamespace(quick=None, lenient=None))
-    monkeypatch.setattr(tracker.Medial, "of", lambda hull: None)
-    monkeypatch.setattr(tracker, "unseen", lambda state, hull: 0.0)
     monkeypatch.setattr(tracker, "with_one_limb", lambda *args: [there])
     asked = []
 

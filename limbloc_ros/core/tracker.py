@@ -254,7 +254,7 @@ class Tracker:
         No further limb is looked for once one elsewhere has made the energy bearable.
         """
         scene = make_scene(hull, Medial.of(hull), surface, self._seed, self._weights, QUICK)
-        missed = unseen(result.state, hull)
+        missed: float | None = None  # what the figure leaves unseen: mostly no limb settles elsewhere, and nobody asks
         for kind, side in limbs:
             for state in with_one_limb(result.state, scene, kind, side, places, QUICK.candidates):
                 if apart_m(state, result.state) < SAME_PLACE_M:
@@ -266,6 +266,7 @@ class Tracker:
                 if other.system.cost > self.GIVEN_UP * result.system.cost:
                     continue
                 other = refine(other.state, evidence, self._firm, self.STEPS, (size,), other.energy)
+                missed = unseen(result.state, hull) if missed is None else missed
                 other_missed = unseen(other.state, hull)
                 gain = result.system.cost + missed - other.system.cost - other_missed
                 jumps = max(1.0, apart_m(other.state, result.state) / self.JUMP_M)
